@@ -33,7 +33,7 @@ POINTS_AT_ONCE = 1 << 13
 """Points that are transformed and summed at a time, so that their arrays stay in the processor's cache."""
 SAMPLE = 50_000
 """Points of an epoch that ICP works with: it only brings the epoch near, and is followed by a fit of the rasters."""
-_BAND = 32
+_BAND = 8
 """Rows to which planes are fitted at a time, so that the sums stay in the processor's cache."""
 
 
@@ -168,7 +168,10 @@ def _fitted(sums: FloatArray, grid: Grid) -> HeightRaster:
     for start in range(0, grid.height, _BAND):
         stop = min(start + _BAND, grid.height)
         low = max(start - 1, 0)
-        around = _about_each_pixel(np.ascontiguousarray(sums[low : stop + 1].transpose(2, 0, 1)))[:, start - low : stop - low]
+        rows = sums[low : stop + 1]
+        margined = np.zeros((10, stop - start + 2, grid.width + 2))
+        margined[:, low - start + 1 : low - start + 1 + len(rows), 1:-1] = rows.transpose(2, 0, 1)
+        around = _about_each_pixel(margined)
         band = slice(start, stop)
         freedom[band] = around[0] - 3
         height[band], scatter[band], slope_x[band], slope_y[band], leverage[band] = _planes(around)
@@ -203,25 +206,26 @@ def _planes(around: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray, Flo
 
 
 def _about_each_pixel(sums: FloatArray) -> FloatArray:
-    """(10, h, w) the sums over 3 x 3 pixels, with u and v from the centre of the middle one: first along rows, then columns."""
-    along = sums.copy()
-    _add_shifted(along[:, :, :-1], sums[:, :, 1:], 1.0, along_u=True)
-    _add_shifted(along[:, :, 1:], sums[:, :, :-1], -1.0, along_u=True)
-    total = along.copy()
-    _add_shifted(total[:, :-1], along[:, 1:], -1.0, along_u=False)
-    _add_shifted(total[:, 1:], along[:, :-1], 1.0, along_u=False)
-    return total
+    """(10, h, w) the sums over 3 x 3 pixels, with u and v from the centre of the middle one; first along rows, then columns.
+
+    sums: (10, h + 2, w + 2) those of each pixel, with a margin of one pixel.
+    """
+    along = _of_three(sums[:, :, :-2], sums[:, :, 1:-1], sums[:, :, 2:], along_u=True)
+    return _of_three(along[:, 2:], along[:, 1:-1], along[:, :-2], along_u=False)
 
 
-def _add_shifted(total: FloatArray, sums: FloatArray, by: float, *, along_u: bool) -> None:
-    """Add the sums of neighbouring pixels (10, h, w) to `total`, with offsets from the centre of the latter.
+def _of_three(before: FloatArray, middle: FloatArray, after: FloatArray, *, along_u: bool) -> FloatArray:
+    """(10, h, w) the sums over three pixels side by side, with offsets from the centre of the middle one.
 
-    This makes the offset u (`along_u`) or v of each of their points larger by `by` pixels, 1 or -1.
+    The offset u (`along_u`) or v of points in the pixel `before` is one pixel smaller than from that pixel's own centre, and in
+    `after` it is one pixel larger.
     """
     own, square, with_z, other = (1, 4, 7, 2) if along_u else (2, 6, 8, 1)
-    for place in {*range(10)} - {own, square, 5, with_z}:
-        total[place] += sums[place]
-    total[own] += sums[own] + by * sums[0]
-    total[square] += sums[square] + 2 * by * sums[own] + sums[0]
-    total[5] += sums[5] + by * sums[other]
-    total[with_z] += sums[with_z] + by * sums[3]
+    total = before + after
+    total[square] += total[0]
+    total += middle
+    total[own] += after[0] - before[0]
+    total[square] += 2 * (after[own] - before[own])
+    total[5] += after[other] - before[other]
+    total[with_z] += after[3] - before[3]
+    return total

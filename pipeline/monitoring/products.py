@@ -192,12 +192,14 @@ class _PointMaps:
     They have a margin of one pixel, for points beside the maps.
 
     grid: of h x w pixels. values (h + 2, w + 2, 2): difference and level of detection of each pixel, m; NaN in the margin. event
-    (h + 2, w + 2): number of the event, 0 for none, in two bytes where these suffice, so that LAZ takes less time.
+    (h + 2, w + 2): number of the event, 0 for none, in two bytes where these suffice, so that LAZ takes less time. any_event:
+    whether there is one.
     """
 
     grid: Grid
     values: NDArray[np.float32]
     event: NDArray[np.uint16] | NDArray[np.uint32]
+    any_event: bool
 
     @classmethod
     def of(cls, epoch: Followed, view: WallView, out: Path) -> _PointMaps:
@@ -206,17 +208,24 @@ class _PointMaps:
         values = np.stack([np.pad(read_geotiff(name)[0], 1, constant_values=np.nan) for name in names], axis=2)
         largest = max((region.identity for region in epoch.regions), default=0)
         event = np.pad(event_raster(epoch.regions, view), 1).astype(np.min_scalar_type(max(largest, _LEAST_LARGEST)))
-        return cls(view.grid, np.rint(values / _VALUE_STEP_M) * _VALUE_STEP_M, event)
+        return cls(view.grid, np.rint(values / _VALUE_STEP_M) * _VALUE_STEP_M, event, bool(event.any()))
 
     def fill(self, records: NDArray[np.void], points: FloatArray) -> None:
         """Fill difference, level of detection and event of records (n,) from the maps at points (3, n), frame of the view."""
         column = (points[0] - (self.grid.x_min - self.grid.gsd)) / self.grid.gsd
         row = ((self.grid.y_max + self.grid.gsd) - points[1]) / self.grid.gsd
-        pixel = np.clip(row, 0, self.grid.height + 1, out=row).astype(np.int64) * (self.grid.width + 2)
+        pixel = np.clip(row, 0, self.grid.height + 1, out=row).astype(np.int64)
+        pixel *= self.grid.width + 2
         pixel += np.clip(column, 0, self.grid.width + 1, out=column).astype(np.int64)
-        pairs = self.values.view(np.int64).ravel()[pixel].view(np.float32).reshape(-1, 2)  # faster than by rows
-        records["distance_m"], records["lod_m"] = pairs.T
-        records["event"] = self.event.ravel()[pixel]
+        _pairs_of(records)[:] = self.values.view(np.int64).ravel().take(pixel)
+        records["event"] = self.event.ravel().take(pixel) if self.any_event else 0
+
+
+def _pairs_of(records: NDArray[np.void]) -> NDArray[np.int64]:
+    """Return a view (n,) of the pairs of difference and level of detection in records, eight bytes each, as one number."""
+    place = records.dtype.fields["distance_m"][1] if records.dtype.fields else 0
+    pair = np.dtype({"names": ["pair"], "formats": [np.int64], "offsets": [place], "itemsize": records.dtype.itemsize})
+    return np.asarray(records.view(pair)["pair"])
 
 
 def write_results(result: Result) -> None:

@@ -11,7 +11,7 @@ from gap_cases import write_scan
 
 from benchmarks.gap_closed_form.cases import Case, make
 from pipeline.formats.measurements.measurement import read_measurement
-from pipeline.gap.mean.candidates import Candidate, SineGrid
+from pipeline.gap.mean.candidates import Candidate, SineGrid, Wave
 from pipeline.gap.mean.nonparametric_terms import (
     HARMONIC_SERIES,
     LINE_PATTERN,
@@ -22,7 +22,7 @@ from pipeline.gap.mean.nonparametric_terms import (
 from pipeline.gap.mean.search import MeanSearch
 from pipeline.gap.mean.signatures import _searched, systematic_families
 from pipeline.gap.naming.candidate_families import candidate_families
-from pipeline.gap.naming.named_effects import Estimate, effect_from_estimate
+from pipeline.gap.naming.named_effects import Estimate, _standard_deviations, effect_from_estimate
 from pipeline.gap.residuals.alignment import compute_residuals
 from pipeline.gap.residuals.disparity_raster import raster_cell_px, raster_spacing_px
 from pipeline.gap.residuals.nominal_pair import PixelGeometry
@@ -107,6 +107,30 @@ def test_a_square_wave_is_folded_over_its_period_in_pixels(period: float, least:
 def test_a_sine_stays_a_sine() -> None:
     _, estimate = best(residuals(0.15 * np.sin(2 * np.pi * PIXELS[:, 0] / PERIOD)), [])
     assert estimate.candidate.form == "wave"
+
+
+def test_the_amplitude_is_right_where_the_phase_at_zero_is_not_known() -> None:
+    """A sine whose points lie 150 periods from x = 0, as those of a cyclic range error, begun from a trial period beside its own.
+
+    The oracles are the true values, and sigma sqrt(2 / n) for the standard deviation of an amplitude.
+    """
+    amplitude, x = 0.05, 150 * PERIOD + PIXELS[:, 0]
+    found = residuals(amplitude * np.sin(2 * np.pi * x / PERIOD + 0.7))
+    wave = Wave("period", np.ones(len(x)), x, float(x.mean()), 1e-3)
+    grid = SineGrid("image_x", "amplitude", wave, np.array([0.99, 1.0, 1.01]) / PERIOD, empirical=True)
+    design = MeanSearch(found, [grid], KeyedRandom(1)).design
+    trial = grid.at_period(PERIOD * 1.012)
+    (candidate,), fit = design.fit_refined([trial])
+    values, place = fit.coefficients[-3:], slice(-3, None)
+    told = candidate.parameters(values)
+    std = _standard_deviations(candidate, values, fit.covariance[place, place])
+    expected = SIGMA * np.sqrt(2 / len(x))
+    assert abs(told["amplitude"] - amplitude) < 4 * expected
+    assert std["amplitude"] == pytest.approx(expected, rel=0.5)
+    assert std["phase_rad"] > 10 * expected / amplitude  # at x = 0
+    assert abs(told["period"] - PERIOD) < 4 * std["period"]
+    curve = told["amplitude"] * np.sin(2 * np.pi * x / told["period"] + told["phase_rad"])
+    assert np.abs(curve - amplitude * np.sin(2 * np.pi * x / PERIOD + 0.7)).max() < 8 * expected
 
 
 @pytest.mark.parametrize("lines", [3, 4, 5])

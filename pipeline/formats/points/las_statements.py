@@ -169,6 +169,12 @@ def check_counts(header: laspy.LasHeader, path: Path) -> None:
         )  # fmt: skip
 
 
+def _any_flag(records: np.ndarray[Any, Any]) -> bool:
+    """Whether any of the records (n,) may have a flag; point formats below 6 store flags together with classes."""
+    name = "classification_flags" if "classification_flags" in (records.dtype.names or ()) else "raw_classification"
+    return bool(records[name].any())
+
+
 def flagged(las: Any) -> tuple[np.ndarray[Any, np.dtype[np.bool_]], tuple[str, ...]]:
     """Return which points a LAS file takes out of use, as a mask (n,), and notes.
 
@@ -177,11 +183,13 @@ def flagged(las: Any) -> tuple[np.ndarray[Any, np.dtype[np.bool_]], tuple[str, .
     classes = np.asarray(las.classification)
     out = np.zeros(len(classes), dtype=bool)
     notes = []
-    for what, rows in (
-        ("flagged as withheld", np.asarray(las.withheld, dtype=bool)),
-        ("flagged as synthetic", np.asarray(las.synthetic, dtype=bool)),
-        ("classified as noise", (classes == _NOISE[0]) | (classes == _NOISE[1])),
-    ):
+    statements = {}
+    if _any_flag(getattr(las, "points", las).array):
+        statements["flagged as withheld"] = np.asarray(las.withheld, dtype=bool)
+        statements["flagged as synthetic"] = np.asarray(las.synthetic, dtype=bool)
+    if classes.any():
+        statements["classified as noise"] = (classes == _NOISE[0]) | (classes == _NOISE[1])
+    for what, rows in statements.items():
         if rows.all():
             notes.append(f"all points are {what} and are kept")
         elif count := int((rows & ~out).sum()):

@@ -230,12 +230,12 @@ def read_laz(path: Path, *, only_points: bool = False) -> PointCloud:
 def _coordinates(las: laspy.LasData) -> FloatArray:
     """Return the coordinates (n, 3), in the file's unit, stored column by column."""
     found = np.empty((3, len(las.points)))
-    for name, column, scale, offset in zip("XYZ", found, las.header.scales, las.header.offsets, strict=True):
-        steps = las.points.array[name]
-        for start in range(0, len(column), _FILLED_AT_ONCE):
-            part = column[start : start + _FILLED_AT_ONCE]
-            np.multiply(steps[start : start + _FILLED_AT_ONCE], scale, out=part)
-            part += offset
+    for start in range(0, found.shape[1], _FILLED_AT_ONCE):
+        part = slice(start, start + _FILLED_AT_ONCE)
+        records = las.points.array[part]
+        for name, column, scale, offset in zip("XYZ", found[:, part], las.header.scales, las.header.offsets, strict=True):
+            np.multiply(records[name], scale, out=column)
+            column += offset
     return found.T
 
 

@@ -31,6 +31,7 @@ from pipeline.formats.units import agreed_units
 from scene.common.errors import InputError
 from scene.common.regular_file import check_file
 from scene.common.threads import map_in_threads
+from scene.geometry.bounds import bounding_box
 from scene.geometry.mesh import FloatArray
 
 CHUNK = 2_000_000
@@ -121,16 +122,16 @@ class ChunkWriter:
             self._records["bit_fields"] = _SINGLE_RETURN
         records = self._records[:count]
 
-        def filled(start: int) -> NDArray[np.int64]:
+        def filled(start: int) -> NDArray[Any]:
             part = slice(start, min(start + _FILLED_AT_ONCE, count))
             fill(records[part], part)
-            return np.array([[records[axis][part].min(), records[axis][part].max()] for axis in "XYZ"], dtype=np.int64)
+            return bounding_box(np.stack([records[axis][part] for axis in "XYZ"]).T)
 
         boxes = np.array(map_in_threads(filled, range(0, count, _FILLED_AT_ONCE)))
         self._las.point_writer.write_points(laspy.PackedPointRecord(records, self._las.header.point_format))
-        self._extend_header(count, boxes[:, :, 0].min(axis=0), boxes[:, :, 1].max(axis=0))
+        self._extend_header(count, boxes[:, 0].min(axis=0), boxes[:, 1].max(axis=0))
 
-    def _extend_header(self, count: int, low: NDArray[np.int64], high: NDArray[np.int64]) -> None:
+    def _extend_header(self, count: int, low: NDArray[Any], high: NDArray[Any]) -> None:
         """Extend numbers and bounding box in the header, as laspy does, but without another look at all points."""
         header = self._las.header
         header.mins = np.minimum(header.mins, low * self.scales + self.offsets)

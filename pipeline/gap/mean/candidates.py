@@ -39,13 +39,15 @@ class Wave:
     key : Name of the effect's parameter that holds the period, such as `period_px`.
     factor : (n,) change of the observable (range in m, disparity in px, or distance in m) at n points for a sine of value 1.
     x : (n,) quantity along which the sine runs, such as an angle in rad.
+    middle : Mean of x, at which the phase hardly depends on the period.
     least : Lowest frequency 1 / period to try; a slower sine cannot be distinguished from a linear trend.
     """
 
     key: str
     factor: FloatArray
     x: FloatArray
-    least: float = 0.0
+    middle: float
+    least: float
 
     def columns(self, period: float) -> FloatArray:
         """Return the two design columns of a sinusoidal error at n points for one trial period: sine and cosine, (n, 2).
@@ -77,7 +79,8 @@ class Wave:
         """Return the design columns of a sinusoidal error for one Gauss-Newton step, which also corrects the frequency.
 
         The first two columns are the sine and the cosine at the present period. The third one is the derivative of the fitted
-        wave with respect to the frequency 1 / period; its coefficient is the correction.
+        wave with respect to the frequency 1 / period, at a constant phase in the middle of the points; its coefficient is the
+        correction (see `with_folded_step`).
 
         Parameters
         ----------
@@ -89,15 +92,34 @@ class Wave:
         (n, 3) columns at the n points.
         """
         sine, cosine = self.columns(period).T
-        derivative = 2 * np.pi * self.x * (coefficients[0] * cosine - coefficients[1] * sine)
+        derivative = 2 * np.pi * (self.x - self.middle) * (coefficients[0] * cosine - coefficients[1] * sine)
         return np.stack([sine, cosine, derivative], axis=1)
+
+    def with_folded_step(self, coefficients: FloatArray, change: float) -> FloatArray:
+        """Return the coefficients of sine and cosine that keep the wave in the middle of the points when its frequency changes.
+
+        The coefficients belong to the phase at x = 0, which is far outside the points if, for example, x is the range. They
+        therefore depend much on the frequency.
+
+        Parameters
+        ----------
+        coefficients : (2,) coefficients of sine and cosine at the present frequency.
+        change : Change of the frequency 1 / period.
+
+        Returns
+        -------
+        (2,) coefficients at the changed frequency.
+        """
+        angle = 2 * np.pi * self.middle * change
+        rotation = np.array([[np.cos(angle), np.sin(angle)], [-np.sin(angle), np.cos(angle)]])
+        return np.asarray(rotation @ coefficients)
 
     def part(self, rows: Rows) -> Wave:
         """Return the sinusoidal error at a subset of its n points, such as the points that a fit uses.
 
         rows: numbers of the points to keep, from 0, as an int64 array; they may be in another order.
         """
-        return Wave(self.key, self.factor[rows], self.x[rows], self.least)
+        return Wave(self.key, self.factor[rows], self.x[rows], self.middle, self.least)
 
 
 @dataclass(frozen=True, eq=False)
@@ -215,11 +237,11 @@ class SineGrid:
 
         period: period in the unit of the quantity along which the sine runs.
         """
-        amplitude, key = self.amplitude, self.wave.key
+        amplitude, wave, key = self.amplitude, self.wave, self.wave.key
 
         def parameters(values: FloatArray) -> dict[str, float]:
-            changed = 1 / (1 / period + (values[2] if len(values) > 2 else 0.0))
-            return amplitude_and_phase(values[:2], amplitude) | {key: float(changed)}
+            change = float(values[2]) if len(values) > 2 else 0.0
+            return amplitude_and_phase(wave.with_folded_step(values[:2], change), amplitude) | {key: 1 / (1 / period + change)}
 
         names = (amplitude, "phase_rad", key)
         form = "wave" if self.empirical else ""

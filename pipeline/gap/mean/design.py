@@ -332,17 +332,21 @@ class Design:
         found = list(candidates)
         wave_coefficients: list[FloatArray | None] = [None] * len(found)
         if any(candidate.wave is not None for candidate in found):
-            for number in range(rounds):
+            for _ in range(rounds):
                 fit = self.fit(found, wave_coefficients)
                 start = len(self.pose_columns)
                 for index, candidate in enumerate(found):
-                    width = candidate.columns.shape[1] + (wave_coefficients[index] is not None)
+                    wave, present = candidate.wave, wave_coefficients[index]
+                    width = candidate.columns.shape[1] + (present is not None)
                     values, start = fit.coefficients[start : start + width], start + width
-                    if candidate.wave is None:
+                    if wave is None:
                         continue
-                    if wave_coefficients[index] is not None and number:
-                        found[index] = with_period(candidate, candidate.wave.stepped_period(candidate.period, float(values[2])))
-                    wave_coefficients[index] = values[:2]
+                    if present is None:
+                        wave_coefficients[index] = values
+                        continue
+                    period = wave.stepped_period(candidate.period, float(values[2]))
+                    wave_coefficients[index] = wave.with_folded_step(values[:2], 1 / period - 1 / candidate.period)
+                    found[index] = with_period(candidate, period)
         return found, self.fit(found, wave_coefficients)
 
     def split_coefficients(self, values: NDArray[Any], candidates: list[Candidate]) -> list[NDArray[Any]]:

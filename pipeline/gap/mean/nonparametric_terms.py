@@ -132,7 +132,7 @@ def _wave_frequencies(x: FloatArray, most_cycles: float, highest: float = np.inf
 
 def _wave(factor: FloatArray, x: FloatArray, tried: FloatArray) -> Wave:
     """Make a wave for a non-parametric term in x, starting at the lowest of the frequencies `tried`."""
-    return Wave("period", factor, x, float(tried[0]))
+    return Wave("period", factor, x, float(np.mean(x)), float(tried[0]))
 
 
 def harmonics(covariate: str, sine: Candidate, last: int) -> Candidate:

@@ -128,7 +128,7 @@ def _searched(effect: type[Effect], search: Search, geometry: Geometry, fixed: d
     columns = _sine_and_cosine(effect, geometry, {**fixed, search.period: search.shortest})
     factor = columns[:, 0] * np.sin(angle) + columns[:, 1] * np.cos(angle)
     tried = frequency_grid(low, high, 0.3 / reach, _MOST_PERIODS)
-    yield SineGrid(effect.tag(), amplitude, Wave(search.period, factor, x, low), tried, fixed)
+    yield SineGrid(effect.tag(), amplitude, Wave(search.period, factor, x, float(np.mean(x)), low), tried, fixed)
 
 
 def _shortest(search: Search, geometry: Geometry) -> float:
@@ -193,6 +193,11 @@ def _locking(geometry: PixelGeometry) -> list[SineGrid]:
     reach = float(np.ptp(np.quantile(geometry.disparity, [0.01, 0.99])))
     one = np.ones_like(geometry.disparity)
     return [
-        SineGrid(PixelLocking.tag(), "amplitude_px", Wave("period_px", one, geometry.disparity, float(tried[0])), tried)
+        SineGrid(
+            PixelLocking.tag(),
+            "amplitude_px",
+            Wave("period_px", one, geometry.disparity, float(np.mean(geometry.disparity)), float(tried[0])),
+            tried,
+        )
         for tried in (disparity_frequencies(1 / reduction, reach) for reduction in _REDUCTIONS)
     ]
