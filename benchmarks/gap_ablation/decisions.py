@@ -72,7 +72,7 @@ DONE: dict[str, str] = {
     "missing_returns.least_gain": "merged with `variance.least_gain`",
     "missing_returns.least_isolated_share": "now `missing_returns.least_agreement`",
     "missing_returns.strip_agreement": "merged with `missing_returns.least_agreement`",
-    "changes.median_sigmas": "merged with `changes.faint_sigmas`",
+    "changes.median_sigmas": "merged with `points.registration_outlier_sigmas`, which has the same value",
     "changes.largest_share": "merged with `changes.moved_share`",
     "changes.moved_share": "kept, now 0.2: a test of the program requires it",
     "changes.moved_share_beside_noise": "merged with `changes.moved_share`",

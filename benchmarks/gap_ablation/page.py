@@ -99,7 +99,7 @@ def page(results: Json, command: str) -> str:
     return _PAGE.format(
         total=total, sources=sources, wrong=wrong, before=before, after=after, commit=results["commit"], command=command,
         table="\n".join(lines), merged="\n".join(merged), flips=_flips(results), together=_together(results),
-        groups=_groups(results.get("groups", [])),
+        groups=_groups(results.get("groups", [])), final_commit=results.get("final_commit", results["commit"]),
     )  # fmt: skip
 
 
@@ -195,7 +195,7 @@ merged with the one whose value it shares.
 
 A diagnosis takes up to a minute, so most rules that act could not be switched off one by one. They were changed in two groups:
 deleted, or set to the value of a threshold of the same kind. Where an answer of a case differed, halves of the group were tried
-until the cause was found. These settings were a cause:
+until the cause was found, or the notes of the answer told it. These settings were a cause:
 
 {groups}
 
@@ -209,6 +209,7 @@ Made at commit {commit} by:
 
     {command}
 
+The answers with the thresholds that are left were made at commit {final_commit}, with `--final` and an `--order` of some cases.
 """
 
 

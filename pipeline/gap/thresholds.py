@@ -58,7 +58,10 @@ class PointThresholds(ThresholdGroup):
         "a tenth of the points of a workshop lie beyond it, and a twelfth of a forest's ground, with most of the outliers",
     )
     registration_outlier_sigmas: PositiveFloat = threshold_field(
-        3.5, "standard deviations", "A residual beyond this is an outlier in the robust pose estimate.", JUDGEMENT
+        3.5,
+        "standard deviations",
+        "A residual beyond this is an outlier in the robust pose estimate. The median residual of a change must exceed it.",
+        JUDGEMENT,
     )
     reference_error: PositiveFloat = threshold_field(
         0.02,
@@ -169,9 +172,8 @@ class ChangesThresholds(ThresholdGroup):
     faint_sigmas: PositiveFloat = threshold_field(
         3.0,
         "standard deviations of medians of nine points",
-        "Neighbouring medians beyond this are joined to one region, which finds faint but wide changes. The median residual of "
-        "a change must exceed as many standard deviations. A point counts as moved if the median of it and its neighbours lies "
-        "this many predicted standard deviations off the reference.",
+        "Neighbouring medians beyond this are joined to one region, which finds faint but wide changes. A point counts as "
+        "moved if the median of it and its neighbours lies this many predicted standard deviations off the reference.",
         JUDGEMENT,
     )
     margin: PositiveFloat = threshold_field(

@@ -191,7 +191,7 @@ def _components(z: FloatArray, faint: FloatArray, view: SensorView, eligible: Bo
     first, second = view.neighbour_pairs(np.flatnonzero(side))
     together = side[first] * side[second] > 0
     pairs, size = (first[together], second[together]), np.abs(z)
-    least = max(thresholds().changes.faint_sigmas, _correlated_sigmas(z, view, eligible))
+    least = max(thresholds().points.registration_outlier_sigmas, _correlated_sigmas(z, view, eligible))
     core = _faint_cores(faint, exceeds, pairs, eligible)
     for sign, level, ratio in product((1.0, -1.0), _LEVELS, _RATIOS):
         core |= _significant(sign * z, level, ratio, pairs, eligible, least)
