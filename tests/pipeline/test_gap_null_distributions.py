@@ -80,6 +80,35 @@ def test_of_a_mean_that_is_there(monkeypatch: pytest.MonkeyPatch) -> None:
     assert max(of_the_mean(4, 0.002, 1.0, added=0.002)) < 0.01
 
 
+def of_long_waves(count: int, length_m: float, amplitude: float) -> list[float]:
+    """Return p-values of the remainder, for white noise beside waves of the reference in all directions.
+
+    The waves have nearly one length, like the error of a surface whose longer waves were fitted away. They are summed directly,
+    without any covariance of the mean model.
+    """
+    at = over_the_wall()
+    found = []
+    for seed in range(count):
+        random = np.random.default_rng(seed)
+        angle, phase = random.uniform(0, np.pi, 40), random.uniform(0, 2 * np.pi, 40)
+        turns = 2 * np.pi / (length_m * random.uniform(0.9, 1.1, 40))
+        waves = np.sin(at @ (turns * np.stack([np.cos(angle), np.sin(angle)])) + phase)
+        error = amplitude * waves @ random.standard_normal(40) / np.sqrt(20)
+        residuals = ranges(SIGMA * random.standard_normal(len(at)) + error, at)
+        families = [form for name, values in residuals.covariates.items() for form in nonparametric_terms(name, values)]
+        with threadpool_limits(1, "blas"):  # as `diagnose` has it
+            search = MeanSearch(residuals, families, KeyedRandom(seed))
+            found.append(search.p_value(search.score_families(())[0].score))
+    return found
+
+
+def test_of_a_mean_beside_long_waves_of_the_reference(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Cells of 0.25 m; the waves of the reference are 9 cells long, and as large as the noise of a range."""
+    monkeypatch.setattr(wall_blocks, "_MOST_CELLS", 400)
+    found = of_long_waves(20, 2.25, SIGMA)
+    assert kstest(found, "uniform").pvalue > 0.001, sorted(found)
+
+
 def of_the_spread(count: int, excess: float) -> list[float]:
     """Return p-values of a variance that grows over the wall, of one that is constant and of one of few points."""
     at = over_the_wall()

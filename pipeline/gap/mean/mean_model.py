@@ -35,12 +35,15 @@ from scene.common.keyed_random import KeyedRandom
 from scene.common.threads import map_in_threads
 from scene.geometry.mesh import FloatArray
 
-_ROUGH, _SMOOTH, _WAVY = (0.7, 1.5, 3.0), (1.0, 2.0), (1.7, 2.5, 3.5, 5.0)
-"""Lengths of the three kinds of correlation, in cells, for some 30 x 25 cells: the longest are still short compared with the
-wall.
+_ROUGH, _SMOOTH, _WAVY, _RINGS = (0.7, 1.5, 3.0, 6.0), (1.0, 2.0), (1.7, 2.5, 3.5, 5.0), (6.5, 9.5)
+"""Lengths of the kinds of correlation, in cells. A reference may err by strips or waves as long as a third of the wall."""
+_LONGEST = 0.5
+"""Longest correlation that is tried, as a share of the side of a square with as many cells: longer ones look like sensor errors.
 """
-_BAND = 0.7, 1.9, 6
-"""Shortest and longest wavelength of a wavy error relative to its length, and number of waves that represent the band."""
+_BAND, _NARROW_BAND = (0.7, 1.9, 6), (0.8, 1.3, 5)
+"""Shortest and longest wavelength of a wavy error relative to its length, and number of waves that represent the band. Only few
+long waves fit on a wall, so that their band is narrow: a wide one hides how large single waves get.
+"""
 _RATIOS = np.geomspace(0.003, 300.0, 25)
 """Variances of the reference's error that are tried, relative to the median variance of a cell's mean."""
 _MOST_RATIOS = 6
@@ -148,7 +151,8 @@ class MeanModel:
             values, vectors = eigh(self._whitened(half.T), driver="evd", overwrite_a=True)
             return np.maximum(values, 0.0), vectors
 
-        self._bases: list[tuple[FloatArray, FloatArray]] = map_in_threads(basis, _CORRELATIONS)
+        short = [each for length, each in _CORRELATIONS if length <= _LONGEST * np.sqrt(len(cells))]
+        self._bases: list[tuple[FloatArray, FloatArray]] = map_in_threads(basis, short)
         self._ratios = [0.0, *map(float, _RATIOS)]
         self._white = CellCovariance(0, 0.0, np.ones(len(self._total)))
 
@@ -354,18 +358,23 @@ def _gaussian(length: float, distance: FloatArray) -> FloatArray:
     return np.asarray(np.exp(-0.5 * (distance / length) ** 2))
 
 
-def _wavy(length: float, distance: FloatArray) -> FloatArray:
+def _wavy(band: tuple[float, float, int], length: float, distance: FloatArray) -> FloatArray:
     """Correlation of isotropic waves in a band around a length, in cells."""
-    waves = length * np.geomspace(*_BAND)
+    waves = length * np.geomspace(*band)
     return np.asarray(np.mean([j0(2 * np.pi * distance / wave) for wave in waves], axis=0))
 
 
-_CORRELATIONS: list[Callable[[FloatArray], FloatArray]] = [
-    *(partial(_matern, length) for length in _ROUGH),
-    *(partial(_gaussian, length) for length in _SMOOTH),
-    *(partial(_wavy, length) for length in _WAVY),
+_CORRELATIONS: list[tuple[float, Callable[[FloatArray], FloatArray]]] = [
+    (length, partial(kind, length))
+    for kind, lengths in (
+        (_matern, _ROUGH),
+        (_gaussian, _SMOOTH),
+        (partial(_wavy, _BAND), _WAVY),
+        (partial(_wavy, _NARROW_BAND), _RINGS),
+    )
+    for length in lengths
 ]
-"""Correlations of two cells as functions of their distance in cells."""
+"""Length of each correlation of two cells, and the correlation as a function of their distance, both in cells."""
 
 
 @dataclass(frozen=True)

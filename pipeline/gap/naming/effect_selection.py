@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -32,6 +32,7 @@ from pipeline.gap.naming.named_effects import (
 from pipeline.gap.naming.nonlinear_refit import (
     SearchInput,
     SearchOutcome,
+    repeat_search,
     select_and_refit,
 )
 from pipeline.gap.naming.search_residuals import with_added_variance, with_fitted_variance
@@ -81,6 +82,8 @@ class SelectionResult:
     reference_sigma : standard deviation of the error of the reference surface, in the unit of the observable (m or px).
     noise_ratio : observed over predicted standard deviation of the residuals after the systematic effects.
     detectable : for each effect that was not found, the size at which it would have been found with a probability of 95 %.
+    p_value_beside : function that computes the p-value of the misfit beside some of the selected systematic effects, given by
+        their names. It repeats the search with them in the model, and returns None if it cannot.
     """
 
     tried: tuple[FamilyScore, ...]
@@ -94,12 +97,13 @@ class SelectionResult:
     reference_sigma: float
     noise_ratio: float
     detectable: tuple[DetectableSize, ...]
+    p_value_beside: Callable[[frozenset[str]], float | None] = lambda _: None
 
     def p_value_given(self, named: Sequence[NamedEffect]) -> float | None:
-        """Look up the p-value of the misfit that remains if only some of the selected effects are kept in the sensor model.
+        """Return the p-value of the misfit that remains if only some of the selected effects are kept in the sensor model.
 
-        It serves the verdict after validation has dropped effects. Only the p-values with all selected systematic effects and
-        with none of them are known.
+        It serves the verdict after validation has dropped effects. The p-values with all selected systematic effects and with
+        none of them are known; for a part of them it is computed.
 
         Parameters
         ----------
@@ -107,12 +111,12 @@ class SelectionResult:
 
         Returns
         -------
-        float or None : the p-value; None if only a part of the selected systematic effects is kept.
+        float or None : the p-value; None if nothing was left to try, or if it cannot be computed.
         """
         kept = self.systematic & {item.name for item in named}
         if kept == self.systematic:
             return self.p_value
-        return None if kept else self.p_without_effects
+        return self.p_value_beside(kept) if kept else self.p_without_effects
 
 
 def select_effects(
@@ -241,11 +245,24 @@ def select_effects(
         sigma,
         noise_ratio_left,
         _detectable_sizes(found, [each.effect for each in noise_terms], left, random),
+        lambda kept: _p_value_beside(points, found, kept),
     )
     angles = [each for each in systematic if each.effect is AngleEmpirical]
     if angles and not model_has(measurement, AngleEmpirical.tag()):
         return _select_beside_angle_terms(measurement, all_residuals, angles, result, random, excluded)
     return named, result
+
+
+def _p_value_beside(points: SearchInput, found: SearchOutcome, kept: frozenset[str]) -> float | None:
+    """Return the p-value of the misfit beside some of the effects that were found, whose sizes are fitted anew.
+
+    kept: their names, with the sensor's prefix. None if one of them is unknown or an empirical term, or if the search fails.
+    """
+    estimates = {f"{points.part.sensor}.{each.candidate.name}": each for each in found.estimates if not each.candidate.empirical}
+    if not kept <= set(estimates):
+        return None
+    again = repeat_search(points, [estimates[name] for name in sorted(kept)], found.search.single_effect_ratios)
+    return None if again is None else again[0].goodness_of_fit_p_value(again[0].score_families(()))
 
 
 def _detectable_sizes(
@@ -307,7 +324,11 @@ def _select_beside_tiles(
     aligned, found, _ = aligned_with(measurement, [tiles], part.index)
     at = at_points_of(found, part)
     named, result = select_effects(aligned, at, fit_pose_robustly(at)[2], random, excluded)
-    return [tiles, *named], replace(result, systematic=result.systematic | {tiles.name})
+
+    def beside(kept: frozenset[str]) -> float | None:
+        return result.p_value_given([each for each in named if each.name in kept]) if tiles.name in kept else None
+
+    return [tiles, *named], replace(result, systematic=result.systematic | {tiles.name}, p_value_beside=beside)
 
 
 def _select_beside_angle_terms(

@@ -389,7 +389,7 @@ def _search_beside(given: SearchInput, chosen: SearchOutcome) -> SearchOutcome |
     physical = [each for each in chosen.estimates if not each.candidate.empirical]
     if not physical or out_of_bounds(given.measurement, chosen.estimates, chosen.residuals):
         return None
-    again = _repeat_search(given, physical, chosen.search.single_effect_ratios)
+    again = repeat_search(given, physical, chosen.search.single_effect_ratios)
     if again is None:
         return None
     search, at, estimates, further, tried = again
@@ -406,7 +406,7 @@ def _estimates_of(search: MeanSearch, chosen: list[SelectedEffect]) -> list[Esti
     ]
 
 
-def _repeat_search(
+def repeat_search(
     given: SearchInput, known_effects: list[Estimate], alone: Mapping[ExplanationKey, float]
 ) -> tuple[MeanSearch, Residuals, list[Estimate], list[SelectedEffect], tuple[FamilyScore, ...]] | None:
     """Repeat the search with some effects in the model, whose coefficients stay free like the pose.

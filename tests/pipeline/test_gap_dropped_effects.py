@@ -1,0 +1,46 @@
+"""The misfit is tested anew where validation keeps only some of the selected effects."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from gap_cases import Array, Scan, write_scan
+
+from pipeline.formats.measurements.measurement import Measurement, read_measurement
+from pipeline.gap.mean.candidates import Candidate, SineGrid
+from pipeline.gap.naming import effect_selection, nonlinear_refit
+from pipeline.gap.naming.candidate_families import candidate_families
+from pipeline.gap.residuals.alignment import align, fit_pose_robustly
+from pipeline.gap.residuals.residuals import Residuals
+from scene.common.keyed_random import KeyedRandom
+
+TRUE = "range_cyclic", "range_incidence_bias"
+
+
+def _ranges(scan: Scan) -> Array:
+    """Return ranges with a cyclic error of 4 mm, and an error of up to centimetres that grows with the incidence angle."""
+    return scan.R + 0.004 * np.sin(2 * np.pi * scan.R / 3.0) + 0.006 * (1 / scan.cos_i - 1)
+
+
+def _few(measurement: Measurement, part: Residuals) -> list[Candidate | SineGrid]:
+    return [each for each in candidate_families(measurement, part) if each.name in (*TRUE, "range_offset", "range_scale")]
+
+
+def test_what_one_of_two_true_effects_leaves_is_significant(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    write_scan(tmp_path, 5, step_rad=0.009, ranges=_ranges)
+    monkeypatch.setattr(effect_selection, "candidate_families", _few)
+    monkeypatch.setattr(nonlinear_refit, "candidate_families", _few)
+    there, residuals, _ = align(read_measurement(tmp_path))
+    part = residuals.part(residuals.usable)
+    named, result = effect_selection.select_effects(there, part, fit_pose_robustly(part)[2], KeyedRandom(1))
+    systematic = [item for item in named if not item.adds_variance]
+    assert {item.name for item in systematic} == {f"tls.{name}" for name in TRUE}
+    both = result.p_value_given(systematic)
+    assert both is not None
+    assert both > 0.01
+    for kept in systematic:
+        alone = result.p_value_given([kept])
+        assert alone is not None, "the misfit beside a part of the effects was not tested"
+        assert alone <= 0.01
