@@ -98,7 +98,7 @@ def page(results: Json, command: str) -> str:
     before, after = len(results["thresholds"]), sum(len(group) for group in Thresholds().model_dump().values())
     return _PAGE.format(
         total=total, sources=sources, wrong=wrong, before=before, after=after, commit=results["commit"], command=command,
-        table="\n".join(lines), merged="\n".join(merged), flips=_flips(results), together=_together(results["together"]),
+        table="\n".join(lines), merged="\n".join(merged), flips=_flips(results), together=_together(results),
         groups=_groups(results.get("groups", [])),
     )  # fmt: skip
 
@@ -113,13 +113,19 @@ def _cells(found: Json) -> str:
     )
 
 
-def _together(found: Json) -> str:
+def _together(results: Json) -> str:
     """Return a paragraph on the cases that were diagnosed with the thresholds that are left."""
+    said = f"With the thresholds that are left, {_turned(results['together'], 'of the cases were diagnosed again')}"
+    fresh = results.get("fresh")
+    return said if fresh is None else f"{said} {_turned(fresh, 'further cases in closed form were diagnosed with both')}"
+
+
+def _turned(found: Json, cases: str) -> str:
+    """Say how many answers differ, become wrong and become right; cases: what follows their number."""
     changes = ", ".join([*found["became wrong"], *found["became right"], *found["other errors"]])
     return (
-        f"With the thresholds that are left, {found['diagnosed']} of the cases were diagnosed again: {found['other answers']} "
-        f"have another verdict or other names, {len(found['became wrong'])} became wrong, and "
-        f"{len(found['became right'])} became right{changes and f' ({changes})'}."
+        f"{found['diagnosed']} {cases}: {found['other answers']} have another verdict or other names, "
+        f"{len(found['became wrong'])} became wrong, and {len(found['became right'])} became right{changes and f' ({changes})'}."
     )
 
 

@@ -116,13 +116,7 @@ class MeanThresholds(ThresholdGroup):
         "geometry of small angles",
         lt=1,
     )
-    least_nonparametric_score: PositiveFloat = threshold_field(
-        12.0,
-        "log-likelihood",
-        "A non-parametric term needs at least this score. The reference error departs a little from its model, and a flexible "
-        "term absorbs that first.",
-        DEVELOPMENT,
-    )
+    most_effects: PositiveInt = threshold_field(3, "effects", "At most this many systematic effects are selected.", JUDGEMENT)
     absorbed_share: PositiveFloat = threshold_field(
         0.1,
         "share of the signature's sum of squares",

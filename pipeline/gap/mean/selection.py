@@ -1,4 +1,4 @@
-"""Select the systematic effects: forward selection of sets, tested against a simulated null distribution.
+"""Select the systematic effects: forward selection of sets of up to three, tested against a simulated null distribution.
 
 The score of a candidate is its penalised log-likelihood ratio: the log-likelihood ratio minus twice its mean under the
     null. It estimates the ratio on new data; for k linear columns the penalty is k, as in AIC, and it is larger if a period
@@ -17,8 +17,8 @@ from pipeline.gap.mean.nonparametric_terms import POLYNOMIAL, SPATIAL_NULL
 from pipeline.gap.thresholds import equivalence_margin, thresholds
 from sensors.effects.range_offset import RangeOffset
 
-_BEAM_WIDTH, _MOST_EFFECTS = 5, 9
-"""Number of the best sets of one size that are grown further (beam width), and largest size of a set."""
+_BEAM_WIDTH = 5
+"""Number of the best sets of one size that are grown further (beam width)."""
 _NOT_SPATIAL = ("intensity", "disparity_fraction")
 """Covariates that do not vary along the wall, so that the reference's error cannot imitate their effects."""
 
@@ -133,16 +133,21 @@ def _replacements(names: frozenset[str], name: str, margin: float, scores: SetSc
     return [other for each in sorted(as_good, key=lambda each: -scores[each]) for other in each - others if other != name]
 
 
+def _least_nonparametric_score() -> float:
+    """Return the score that a non-parametric term needs: `variance.least_gain` against the reference, and against effects."""
+    return 2 * thresholds().variance.least_gain
+
+
 def _unreported_score(form: FamilyScore | None) -> float:
     """Score of a non-parametric term that is too weak to be reported, which a weak effect must still beat; else 0."""
-    return form.score if form is not None and form.score < thresholds().mean.least_nonparametric_score else 0.0
+    return form.score if form is not None and form.score < _least_nonparametric_score() else 0.0
 
 
 def _beats_spatial_null(item: FamilyScore, null_score: float) -> bool:
     """Tell whether a non-parametric term clearly beats the best spatial null candidate, whose score is `null_score`."""
     beats = item.score > null_score + thresholds().variance.least_gain
     if item.candidate.form == POLYNOMIAL:
-        return beats and item.score > thresholds().mean.least_nonparametric_score
+        return beats and item.score > _least_nonparametric_score()
     return beats or item.name in _NOT_SPATIAL
 
 
@@ -212,7 +217,7 @@ class ForwardSelection:
         """
         empty = _Set((), 0.0, self.search.score_families(()))
         levels, scores = [[empty]], SetScores()
-        while len(levels) <= _MOST_EFFECTS:
+        while len(levels) <= thresholds().mean.most_effects:
             grown, of_sets = self._grow(levels[-1])
             if not grown or not self._significant(grown[0].score - levels[-1][0].score):
                 break
@@ -271,7 +276,7 @@ class ForwardSelection:
         best, empty = levels[-1][0], levels[0][0]
         if (
             best.nonparametric is not None
-            and best.nonparametric.score >= thresholds().mean.least_nonparametric_score
+            and best.nonparametric.score >= _least_nonparametric_score()
             and self._significant(best.nonparametric.score)
         ):
             found: tuple[_Set, FamilyScore] | None = None

@@ -13,6 +13,7 @@ from pipeline.gap.noise_and_edges.edge_effects import EdgeEffect, WallBlocks, lo
 from pipeline.gap.residuals.residuals import BoolArray
 from pipeline.gap.residuals.scan_simulation import simulate_ranges, simulate_ranges_by_mode, systematic_part
 from pipeline.gap.residuals.tls_residuals import TlsResiduals
+from pipeline.gap.thresholds import thresholds
 from scene.common.keyed_random import KeyedRandom
 from scene.geometry.mesh import FloatArray
 from sensors.effects.angle_noise import AngleNoise
@@ -74,7 +75,7 @@ def find_footprint(
 
     best_divergence = {mode: maximise_gain(partial(gains, mode), _DIVERGENCES_RAD, ()) for mode in _MODES}
     mode = max(best_divergence, key=lambda each: float(gains(each, best_divergence[each]).sum()))
-    gain = blocks.total_if_agreed(gains(mode, best_divergence[mode]))
+    gain = blocks.total_if_agreed(gains(mode, best_divergence[mode]), thresholds().edges.least_block_sigmas)
     if gain is None:
         return []
     divergence = maximise_gain(partial(gains, mode), [best_divergence[mode]], _REFINEMENT_FACTORS)

@@ -80,7 +80,7 @@ class WallBlocks:
         """
         return np.asarray(np.bincount(self.number, gains))
 
-    def total_if_agreed(self, gains: FloatArray, *, by_signs: bool = False) -> float | None:
+    def total_if_agreed(self, gains: FloatArray, least_sigmas: float | None = None, *, by_signs: bool = False) -> float | None:
         """Test an edge effect: return its log-likelihood ratio if it is large enough and the wall blocks agree, else None.
 
         Agreement is measured like a number of standard deviations: the sum of the wall blocks' ratios over the root of the sum
@@ -89,6 +89,7 @@ class WallBlocks:
         Parameters
         ----------
         gains : (n,) log-likelihood ratio of each point: model with the effect against model without it.
+        least_sigmas : smallest agreement that is accepted; None: the threshold `edges.block_sigmas`.
         by_signs : whether agreement of the signs alone is enough, for effects of which a few wall blocks hold most of the
             points.
         """
@@ -98,7 +99,7 @@ class WallBlocks:
         if by_signs:
             signs = np.sign(sums[sums != 0])
             sigmas = max(sigmas, float(signs.sum()) / max(float(np.linalg.norm(signs)), 1.0))
-        if total < by.least_gain or sigmas < by.block_sigmas:
+        if total < by.least_gain or sigmas < (by.block_sigmas if least_sigmas is None else least_sigmas):
             return None
         return total
 

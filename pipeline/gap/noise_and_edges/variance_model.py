@@ -252,10 +252,11 @@ def fit_variance_model(
     free_name, free_score, free = _best_binned_variance(squares, {name: v[used] for name, v in residuals.covariates.items()})
     # no form of a variance is exact, so a second effect or a free form must explain more than the inexact part of the first
     needed = max(by.least_gain, thresholds().mean.class_share * best.gain)
-    agreed = pair.score > best.score + needed and _blocks_agree(squares, best.added(shapes), pair.added(shapes), block)
+    agreement = _agreement(squares, best.added(shapes), pair.added(shapes), block)
+    agreed = pair.score > best.score + needed and agreement > thresholds().edges.block_sigmas
     chosen = pair if agreed and all(float(theta.max()) > 0 for theta in pair.theta) else best
-    ahead = free_score - chosen.score
-    free_fits_better = ahead > needed and _blocks_agree(squares, chosen.added(shapes), free, block)
+    ahead, agreement = free_score - chosen.score, _agreement(squares, chosen.added(shapes), free, block)
+    free_fits_better = ahead > needed and agreement > thresholds().edges.least_block_sigmas
     empirical = free_fits_better and ahead > by.nonparametric_share * chosen.gain
     note = f"the noise also varies with {free_name}, which no effect of the catalogue explains" if free_fits_better else ""
     if empirical:
@@ -435,11 +436,14 @@ def _replaces_only(fit: _JointFit, chosen: _JointFit, number: int) -> bool:
     return number not in fit.members and set(chosen.members) - {number} <= set(fit.members)
 
 
-def _blocks_agree(squares: FloatArray, first: FloatArray, second: FloatArray, block: NDArray[np.int64]) -> bool:
-    """Whether wall blocks agree that one variance fits better than another, so that the gain is not due to a few blocks."""
+def _agreement(squares: FloatArray, first: FloatArray, second: FloatArray, block: NDArray[np.int64]) -> float:
+    """Return how far wall blocks agree that the second variance fits better, so that the gain is not due to a few blocks.
+
+    It is the log-likelihood ratio over the root sum of squares of the wall blocks' contributions.
+    """
     terms = 0.5 * (squares * (second - first) / ((1 + first) * (1 + second)) + np.log1p(first) - np.log1p(second))
     sums = np.bincount(np.unique(block, return_inverse=True)[1], terms)
-    return float(sums.sum()) > thresholds().edges.block_sigmas * float(np.linalg.norm(sums))
+    return float(sums.sum()) / max(float(np.linalg.norm(sums)), 1e-300)
 
 
 def _log_likelihood_gain(squares: FloatArray, added: FloatArray) -> float:
