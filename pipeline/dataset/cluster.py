@@ -15,7 +15,7 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import CancelledError, ThreadPoolExecutor
 from contextlib import ExitStack, contextmanager, suppress
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
 from itertools import groupby
 from typing import TYPE_CHECKING, Any, TypeAlias
@@ -31,8 +31,6 @@ if TYPE_CHECKING:
 
     from pipeline.dataset.worker import EpochOrder
 
-BackgroundStart: TypeAlias = "StartedFuture[tuple[LocalCluster, Client]]"
-"""Workers that are being started in a thread (`workers_in_background`)."""
 Run: TypeAlias = "list[EpochOrder]"
 """Epochs that a worker makes in one go."""
 _POOLS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
@@ -70,11 +68,22 @@ def runs(orders: Sequence[EpochOrder], workers: int) -> list[Run]:
     return found
 
 
+@dataclass(frozen=True)
+class BackgroundWorkers:
+    """Local worker processes that a thread starts and ends, so that this process can do other work meanwhile.
+
+    started: the cluster and its client once the workers have started. end: lets the thread end the workers.
+    """
+
+    started: StartedFuture[tuple[LocalCluster, Client]]
+    end: Callable[[], object]
+
+
 @contextmanager
-def workers_in_background(count: int, modules: Sequence[str]) -> Iterator[BackgroundStart]:
+def workers_in_background(count: int, modules: Sequence[str]) -> Iterator[BackgroundWorkers]:
     """Start local worker processes in a thread, while this process prepares the work that `map_on_workers` gives them later.
 
-    They end with the block.
+    They have ended when the block ends; `map_on_workers` lets them end once it has all results.
 
     Parameters
     ----------
@@ -93,11 +102,11 @@ def workers_in_background(count: int, modules: Sequence[str]) -> Iterator[Backgr
         return cluster, _client(stack, cluster)
 
     with ExitStack() as stack, ThreadPoolExecutor(1) as pool:
-        yield pool.submit(start)
+        yield BackgroundWorkers(pool.submit(start), lambda: pool.submit(stack.close))
 
 
 def map_on_workers(
-    function: Callable[..., Any], tasks: Sequence[tuple[Any, ...]], count: int, started: BackgroundStart | None = None
+    function: Callable[..., Any], tasks: Sequence[tuple[Any, ...]], count: int, workers: BackgroundWorkers | None = None
 ) -> Iterator[Any]:
     """Call a function with each task's arguments on local worker processes, and yield the results as they finish.
 
@@ -106,7 +115,7 @@ def map_on_workers(
     function : Function of a module, which workers import; what it raises is raised here.
     tasks : Arguments of each call.
     count : Number of workers.
-    started : Workers that were started before; None: they are started now.
+    workers : Workers that were started before; None: they are started now.
 
     Raises
     ------
@@ -120,8 +129,8 @@ def map_on_workers(
     for start in range(1, _STARTS + 1):
         try:
             with ExitStack() as stack:
-                if started is not None and start == 1:
-                    cluster, client = started.result()
+                if workers is not None and start == 1:
+                    cluster, client = workers.started.result()
                 else:
                     cluster = _local(stack, min(count, len(left)))
                     client = _client(stack, cluster)
@@ -129,6 +138,8 @@ def map_on_workers(
                 for future, result in _results(client, futures, cluster):
                     del left[future.key]
                     yield result
+            if workers is not None:
+                workers.end()
             return
         except _LostError as lost:
             if start == _STARTS:

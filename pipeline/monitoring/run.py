@@ -17,7 +17,7 @@ from pathlib import Path
 
 import numpy as np
 
-from pipeline.dataset.cluster import BackgroundStart, map_on_workers, workers_in_background
+from pipeline.dataset.cluster import BackgroundWorkers, map_on_workers, workers_in_background
 from pipeline.formats.files.atomic import empty_folder, write_bytes
 from pipeline.formats.files.checksum import sha256
 from pipeline.formats.rasters.geotiff import write_geotiff
@@ -140,7 +140,7 @@ def _monitored(
     workers: int,
     resume: bool,
     progress: Progress,
-    started: BackgroundStart | None,
+    started: BackgroundWorkers | None,
 ) -> Result:
     """Do the work of `monitor`, on workers that were started before if there are any."""
     with progress.stage(f"reference {sources[0].name}"):
@@ -192,7 +192,7 @@ def _compared_in_processes(
     fingerprint: str,
     workers: int,
     progress: Progress,
-    started: BackgroundStart | None,
+    started: BackgroundWorkers | None,
 ) -> dict[int, EpochRecord | None]:
     """The records of epochs, compared on local workers of Dask, by number."""
     found: dict[int, EpochRecord | None] = {}
