@@ -21,4 +21,4 @@ def test_the_parts_of_a_diagnosis_add_up(
     assert {"search: design and null", "noise", "gap"} <= set(found.parts)
     monkeypatch.setattr(gap_cost, "cost_of", {tmp_path: found}.__getitem__)
     main([str(tmp_path)])
-    assert f"{tmp_path.name} (" in capsys.readouterr().out
+    assert f"| {tmp_path.name} | tls |" in capsys.readouterr().out
