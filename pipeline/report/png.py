@@ -18,7 +18,7 @@ _COLOUR_TYPES = {3: 2, 4: 6}
 """PNG's colour type by the number of channels."""
 _BITS = 8
 _LEVEL = 1
-"""Level of compression: higher ones take several times as long for files that are a tenth smaller."""
+"""Compression level of PNG files: a higher one takes several times as long and makes them a tenth smaller."""
 _INCH_M = 0.0254
 
 

@@ -93,7 +93,7 @@ def read_chunks(path: Path, unit: str | None = None) -> Iterator[FloatArray]:
 
 
 class ChunkWriter:
-    """Writes the points of a LAZ file part by part (`chunk_writer` opens one).
+    """Writes a LAZ file from points that are added one array after another; `chunk_writer` opens it.
 
     Attributes
     ----------

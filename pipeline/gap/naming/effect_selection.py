@@ -100,7 +100,7 @@ class SelectionResult:
     p_value_beside: Callable[[frozenset[str]], float | None] = lambda _: None
 
     def p_value_given(self, named: Sequence[NamedEffect]) -> float | None:
-        """Return the p-value of the misfit that remains if only some of the selected effects are kept in the sensor model.
+        """Return the p-value of the misfit that is left when the sensor model holds only some of the selected effects.
 
         It serves the verdict after validation has dropped effects. The p-values with all selected systematic effects and with
         none of them are known; for a part of them it is computed.
