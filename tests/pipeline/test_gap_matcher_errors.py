@@ -41,15 +41,18 @@ def measured(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, seed: int, error: 
     return found
 
 
-@pytest.mark.parametrize(("seed", "cells"), [(1, 1), (3, 3)])
+@pytest.mark.parametrize(("seed", "cells", "step_px"), [(1, 1, 1.0), (3, 3, 1.0), (1, 2, 7.0)])
 def test_a_window_that_takes_the_nearest_rock_is_found_beside_its_pose(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, seed: int, cells: int
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, seed: int, cells: int, step_px: float
 ) -> None:
-    """It changes most disparities of a steep wall, so that the pose that fits best without it is off."""
+    """A small step changes most disparities of a steep wall, so that the pose that fits best without it is off.
+
+    A large one lies between those that are tried first, and few points show it.
+    """
 
     def nearest(disparity: Any, _step: int) -> Any:
         largest = ndimage.maximum_filter(np.where(np.isnan(disparity), -np.inf, disparity), 2 * cells + 1)
-        return np.where(largest - disparity > 1.0, largest, disparity)
+        return np.where(largest - disparity > step_px, largest, disparity)
 
     there = measured(tmp_path, monkeypatch, seed, nearest)
     initial = compute_residuals(there)
@@ -65,7 +68,7 @@ def test_a_window_that_takes_the_nearest_rock_is_found_beside_its_pose(
     step = raster_cell_px(initial.geometry.u, initial.geometry.v)
     assert step is not None
     assert named.effect.window == "square"
-    assert named.effect.step_px == pytest.approx(1.0, rel=0.25)
+    assert named.effect.step_px == pytest.approx(step_px, rel=0.25)
     assert named.effect.radius_px == pytest.approx(cells * step, abs=2 * named.std["radius_px"])
 
 

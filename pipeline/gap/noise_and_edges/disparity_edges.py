@@ -35,8 +35,9 @@ _SIGMAS = (0.5, 0.7, 1.0, 1.4, 2.0, 2.8, 4.0, 5.6, 8.0, 11.0)
 """Radii of edge fattening, cells; depth steps of rims, in the smallest one that counts (which is tried too), and of windows, px;
 standard deviations of the low-pass, cells."""
 _REFINEMENT_FACTORS = (1.1, 1.03)
+_WINDOWS = ("disc", "square")
 _STEP_FACTORS = (1.2, 1.05)
-"""Ratios of neighbouring steps in the refinements of a window's step."""
+"""Ratios of neighbouring steps in the refinements of a rim's step."""
 _ROUNDED_CELLS = 0.25, 1.5 / np.sqrt(12)
 """Mean and standard deviation, cells, of a radius minus the whole cells that it reaches: a matcher may round it down, or to the
 nearest number, so that it lies between -0.5 and 1."""
@@ -145,6 +146,21 @@ class _EdgeData:
         least = self.raster.depth_step_px if effect.window == "rim" else 0.0
         clear = np.abs(self.shift([effect]) - self.shift_without) > least
         return (self.registered_density([effect]) - self.registered_density_without) * clear
+
+    def likeliest_step(self, window: EdgeFattening) -> float | None:
+        """Return the depth step from which on a window takes effect, px, with the largest likelihood at the present pose.
+
+        window: the effect with the smallest step to try. None if no step makes the residuals more likely.
+        """
+        shift = self.shift([window]) - self.shift_without
+        gains = self.gains(window)
+        order = np.argsort(-shift)[: np.count_nonzero(shift > window.step_px)]
+        total = np.cumsum(gains[order])
+        if not len(total) or total.max() <= 0:
+            return None
+        last = int(np.argmax(total))
+        lower = shift[order[last + 1]] if last + 1 < len(order) else window.step_px
+        return float((shift[order[last]] + lower) / 2)
 
     def edge_effect(self, effect: Effect, std: dict[str, float], gain: float) -> EdgeEffect:
         """Return the result for an effect that was accepted beside the known ones."""
@@ -360,16 +376,26 @@ def most_likely_fattening(data: _EdgeData) -> EdgeFattening:
         sums = map_in_threads(lambda each: float(data.registered_density([each]).sum()), trials)
         return trials[int(np.argmax(sums))]
 
+    def with_best_step(at: _EdgeData, window: str, radius: int) -> list[EdgeFattening]:
+        step = at.likeliest_step(trial(window, radius, _WINDOW_STEPS_PX[0]))
+        return [] if step is None else [trial(window, radius, step)]
+
     rim = (0.0, *(height * smallest for height in _RIM_STEPS))
-    steps = {"rim": rim, "disc": _WINDOW_STEPS_PX, "square": _WINDOW_STEPS_PX}
-    best = most_likely([trial(window, radius, step) for window, tried in steps.items() for step in tried for radius in _RADII])
-    if best.window == "rim":
+    steps = {"rim": rim, **dict.fromkeys(_WINDOWS, _WINDOW_STEPS_PX)}
+    trials = [trial(window, radius, step) for window, tried in steps.items() for step in tried for radius in _RADII]
+    best = most_likely(trials + [each for window in _WINDOWS for radius in _RADII for each in with_best_step(data, window, radius)])
+    if data.registered_density([best]).sum() <= data.registered_density_without.sum():
         return best
     for factor in _STEP_FACTORS:
         radius = int(best.radius_px / cell)
-        tried = [best.step_px * factor**power for power in range(-3, 4)]
         radii = [each for each in (radius - 1, radius, radius + 1) if each]
-        best = most_likely([trial(best.window, each, step) for each in radii for step in tried])
+        if best.window == "rim":
+            tried = [max(best.step_px, smallest) * factor**power for power in range(-3, 4)]
+            trials = [trial("rim", each, step) for each in radii for step in tried if step >= smallest]
+        else:
+            registered = data.registered_with(best)
+            trials = [each for radius in radii for each in with_best_step(registered, best.window, radius)]
+        best = most_likely([best, *trials])
     return best
 
 
