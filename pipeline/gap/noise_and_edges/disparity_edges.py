@@ -383,7 +383,8 @@ def most_likely_fattening(data: _EdgeData) -> EdgeFattening:
     rim = (0.0, *(height * smallest for height in _RIM_STEPS))
     steps = {"rim": rim, **dict.fromkeys(_WINDOWS, _WINDOW_STEPS_PX)}
     trials = [trial(window, radius, step) for window, tried in steps.items() for step in tried for radius in _RADII]
-    best = most_likely(trials + [each for window in _WINDOWS for radius in _RADII for each in with_best_step(data, window, radius)])
+    trials += [each for window in _WINDOWS for radius in _RADII for each in with_best_step(data, window, radius)]
+    best = most_likely(trials)
     if data.registered_density([best]).sum() <= data.registered_density_without.sum():
         return best
     for factor in _STEP_FACTORS:
