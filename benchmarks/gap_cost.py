@@ -38,7 +38,7 @@ PARTS: dict[str, list[tuple[Any, str]]] = {
     "signatures": [(effect_selection, "candidate_families"), (nonlinear_refit, "candidate_families")],
     "search: design and null": [(MeanSearch, "__init__")],
     "search: selection": [(MeanSearch, "select")],
-    "refits": [(nonlinear_refit, "_strongest_single_fits"), (nonlinear_refit, "search_at_joint_fit")],
+    "refits": [(nonlinear_refit, name) for name in ("_strongest_single_fits", "_screened_single_fits", "search_at_joint_fit")],
     "noise": [(effect_selection, "_fit_variance"), (effect_selection, "find_grid_noise")],
     "detectable sizes": [(effect_selection, "_detectable_sizes")],
     "validation of effects": [(workflow, "validate_effects")],

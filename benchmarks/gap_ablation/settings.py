@@ -41,7 +41,6 @@ OFF: dict[str, float] = {
     "changes.faint_sigmas": LARGE,
     "changes.margin": 0.0,
     "changes.moved_share": LARGE,
-    "validation.least_gain": -LARGE,
     "verdict.least_closed": -LARGE,
     "verdict.overdispersion": LARGE,
 }

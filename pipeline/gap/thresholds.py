@@ -189,22 +189,6 @@ class ChangesThresholds(ThresholdGroup):
     )
 
 
-class ValidationThresholds(ThresholdGroup):
-    """Thresholds of validation: what an effect must gain on wall blocks (parts of the wall) that were not used for fitting.
-
-    The gain is a difference of log scores (log-likelihoods): model with the effect minus model without it.
-    """
-
-    least_gain: PositiveFloat = threshold_field(
-        2.0,
-        "log-likelihood",
-        "Beside other effects an effect must gain more than this on validation blocks to be named, not only mentioned. An "
-        "effect that lowers the log score of the validation blocks by this or more always fails. At this value a gain equals "
-        "its standard error.",
-        "the gain of a true effect, half a difference of two chi^2, has twice its expectation as variance",
-    )
-
-
 class VerdictThresholds(ThresholdGroup):
     """Thresholds of the verdict of `gap`: when the model is rejected, and how much named effects must explain.
 
@@ -251,7 +235,7 @@ class Thresholds(ThresholdGroup):
 
     Each attribute is a group for one test: which points are used; systematic effects (mean); noise (variance); pixel
     locking; effects at depth steps (edges); missing returns; rounded ranges (quantization); changes of the rock;
-    validation; and the verdict.
+    and the verdict.
     """
 
     points: PointThresholds = PointThresholds()
@@ -262,7 +246,6 @@ class Thresholds(ThresholdGroup):
     missing_returns: MissingReturnsThresholds = MissingReturnsThresholds()
     quantization: QuantizationThresholds = QuantizationThresholds()
     changes: ChangesThresholds = ChangesThresholds()
-    validation: ValidationThresholds = ValidationThresholds()
     verdict: VerdictThresholds = VerdictThresholds()
 
 

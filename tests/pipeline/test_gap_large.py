@@ -13,7 +13,7 @@ from gap_cases import write_scan
 
 from benchmarks.gap_closed_form import stereo_cases
 from benchmarks.gap_closed_form.cases import Case, make
-from benchmarks.gap_closed_form.strength import Target
+from benchmarks.gap_closed_form.strength import Strength, Target
 from pipeline.change.robust import nmad
 from pipeline.formats.measurements.measurement import read_measurement
 from pipeline.gap.mean.candidates import Candidate, SineGrid
@@ -22,6 +22,7 @@ from pipeline.gap.mean.mean_model import MeanModel, fit_reml
 from pipeline.gap.mean.search import MeanSearch
 from pipeline.gap.naming import nonlinear_refit
 from pipeline.gap.naming.candidate_families import candidate_families
+from pipeline.gap.naming.effect_screening import rank_by_noise_left
 from pipeline.gap.naming.named_effects import NamedEffect, effect_from_estimate
 from pipeline.gap.naming.nonlinear_refit import (
     SearchInput,
@@ -196,7 +197,7 @@ def test_slopes_do_not_serve_where_what_they_miss_is_as_much_as_something_gains(
     monkeypatch.setattr(nonlinear_refit, "_with_alternatives", lambda _points, _first, alone, _names: alone)
 
     def refitted(wrong_by: float, *ratios: float) -> bool:
-        mean = Thresholds().mean.model_copy(update={"linearisation_error": 2 * wrong_by})
+        mean = Thresholds().mean.model_copy(update={"class_margin": 2 * wrong_by})
         with use_thresholds(Thresholds().model_copy(update={"mean": mean})):
             selected = [replace(chosen[0], log_likelihood_ratio=ratio * wrong_by) for ratio in ratios]
             return bool(_strongest_single_fits(points, first, selected))
@@ -205,6 +206,24 @@ def test_slopes_do_not_serve_where_what_they_miss_is_as_much_as_something_gains(
     assert refitted(one, 1.5)
     assert not refitted(two, 3, 3)
     assert refitted(two, 3, 1.5)
+
+
+def test_the_effect_that_leaves_the_least_noise_ranks_first(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A principal point is off by 8 px; with it in the model, the residuals are as small as the noise again."""
+    drawn = [("principal_point_x", {"camera": "left", "delta_px": 8.0}, Strength(0.0, "", 0.0))]
+    monkeypatch.setattr(stereo_cases, "_drawn", lambda *_: drawn)
+    case = Case(0, (1, 5), "one", "stereo", ("principal_point_x",), 2_000, 2_000)
+    make(case, tmp_path / "case", tmp_path / "truth.json", baselines=False)
+    there, residuals, _ = align(read_measurement(tmp_path / "case"))
+    part = residuals.part(residuals.usable)
+    search = MeanSearch(part, candidate_families(there, part), KeyedRandom(1))
+    tried = [each for each in search.effect_variants() if each.name in {"principal_point_x", "focal_length", "radial_distortion"}]
+    assert len(tried) == 9  # each in the left camera, in the right one and in both
+    ranked = rank_by_noise_left(there, part, tried[::-1])
+    assert [(each.name, each.fixed["camera"]) for each in ranked[:2]] == [
+        ("principal_point_x", "left"),
+        ("principal_point_x", "right"),
+    ]
 
 
 def test_two_large_effects_are_found_where_all_together_fit_best(

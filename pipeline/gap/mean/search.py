@@ -294,6 +294,15 @@ class MeanSearch:
         columns = candidates[0].columns
         return float(np.std(columns @ self.design.split_coefficients(fit.coefficients, candidates)[0][: columns.shape[1]]))
 
+    def effect_variants(self) -> list[Candidate]:
+        """List the sensor errors of the catalogue, once for each camera that can have them, those that explain most first.
+
+        Of the variants of one error in one camera, the one that explains most stands for all. Sines of unknown period are not
+        included.
+        """
+        ranked = [each for _, each in reversed(self._ranked_variants())]
+        return list({(each.name, each.fixed.get("camera")): each for each in ranked}.values())
+
     def leading_effects(self) -> list[Candidate]:
         """List the sensor errors that explain the most on their own, which are worth refitting without linearisation.
 
@@ -304,15 +313,21 @@ class MeanSearch:
         -------
         At most eight candidates, best first.
         """
+        ranked = self._ranked_variants()
+        least = max(thresholds().mean.refit_share * ranked[0][0], thresholds().mean.refit_gain) if ranked else 0.0
+        return [each for ratio, each in ranked if ratio >= least][:_MOST_LEADING]
+
+    def _ranked_variants(self) -> list[tuple[float, Candidate]]:
+        """Effects with each choice of parameters and camera, and their log-likelihood ratios, best first.
+
+        Of variants that differ only in a trial value, such as a limit, the best one stands for all.
+        """
         plain, fixed, _ = self._profile(())
         ratios = fixed[:, 0] - plain[0]
         found = [(ratio, each) for ratio, each in zip(ratios, self.design.families.plain, strict=True) if not each.empirical]
-        # of variants that differ only in a trial value, such as a limit, the best one stands for all
         ascending = sorted(found, key=lambda item: item[0])
         best = {(each.name, each.names, each.fixed.get("camera")): (ratio, each) for ratio, each in ascending}
-        ranked = sorted(best.values(), key=lambda item: -item[0])
-        least = max(thresholds().mean.refit_share * ranked[0][0], thresholds().mean.refit_gain) if ranked else 0.0
-        return [each for ratio, each in ranked if ratio >= least][:_MOST_LEADING]
+        return sorted(best.values(), key=lambda item: -item[0])
 
     def selected_alone(self, candidate: Candidate) -> SelectedEffect:
         """Describe a candidate effect as if it were the only selected one, to refit it alone without linearisation.

@@ -13,6 +13,7 @@ from pipeline.gap.mean.nonparametric_terms import HARMONIC_ORDERS, HARMONICS, ha
 from pipeline.gap.mean.search import MeanSearch
 from pipeline.gap.mean.selection import FamilyScore, SelectedEffect
 from pipeline.gap.naming.candidate_families import PERIODIC, candidate_families, catalogue_families
+from pipeline.gap.naming.effect_screening import estimate_of_size, gauss_newton_step, rank_by_noise_left
 from pipeline.gap.naming.named_effects import Estimate, aligned_with, effect_from_estimate, out_of_bounds
 from pipeline.gap.naming.search_residuals import with_added_variance, with_fitted_variance
 from pipeline.gap.noise_and_edges.variance_model import VarianceTerm
@@ -133,7 +134,7 @@ class _SingleFit:
         """Return the fit after one Gauss-Newton step from the present values; None for the reasons of `of`."""
         candidate = _recomputed(self.estimate.candidate, candidate_families(self.measurement, self.residuals))
         width = candidate.columns.shape[1]
-        step = _gauss_newton_step(self.residuals, candidate.columns, prior_precision(candidate, width), np.zeros(width))
+        step = gauss_newton_step(self.residuals, candidate.columns, prior_precision(candidate, width), np.zeros(width))
         return _SingleFit.of(given, first, replace(self.estimate, values=self.estimate.values + step))
 
 
@@ -164,7 +165,7 @@ def select_and_refit(given: SearchInput, first: MeanSearch) -> SearchOutcome:
     The linearised model is inexact for a large effect, and forward selection then adds spurious effects that absorb the
     linearisation error. Several explanations are therefore compared. One is the linearised selection. For another, the strongest
     effects are refitted alone without linearising, and the selection is repeated with the best one in the model. If that still
-    needs several effects, a third one is tried (`search_at_joint_fit`).
+    needs several effects, all effects are refitted, and a third explanation is tried (`search_at_joint_fit`).
 
     Parameters
     ----------
@@ -181,11 +182,10 @@ def select_and_refit(given: SearchInput, first: MeanSearch) -> SearchOutcome:
     if not alone:
         return _search_beside(given, linear) or linear
     beside_best = _search_beside_best(given, linear, alone)
-    if beside_best is not None and len(beside_best.estimates) > 1:
-        others = {each.candidate.name for each in beside_best.estimates if not each.candidate.empirical}
-        extended = _with_alternatives(given, first, alone, others)
-        if extended[0] is not alone[0]:
-            beside_best = _search_beside_best(given, linear, extended) or beside_best
+    if beside_best is None or len(beside_best.estimates) > 1:
+        screened = _screened_single_fits(given, first, alone)
+        if screened[0] is not alone[0]:
+            beside_best = _search_beside_best(given, linear, screened) or beside_best
     if beside_best is not None and len(beside_best.estimates) == 1:
         return beside_best
     joint = search_at_joint_fit(given)
@@ -252,9 +252,9 @@ def fit_jointly(given: SearchInput, candidates: list[Candidate]) -> tuple[Measur
             break
         before = after
         precision = np.concatenate([prior_precision(each, width) for each, width in zip(candidates, widths, strict=True)])
-        values = values + _gauss_newton_step(at, _all_columns(candidates), precision, values)
+        values = values + gauss_newton_step(at, _all_columns(candidates), precision, values)
         parts = np.split(values, np.cumsum(widths)[:-1])
-        estimates = [_estimate_of_size(each, part) for each, part in zip(candidates, parts, strict=True)]
+        estimates = [estimate_of_size(each, part) for each, part in zip(candidates, parts, strict=True)]
         if out_of_bounds(given.measurement, estimates, at):
             return None
         measurement, found, _ = _aligned_with_estimates(given, estimates)
@@ -278,22 +278,6 @@ def _all_columns(candidates: list[Candidate]) -> FloatArray:
     return columns
 
 
-def _estimate_of_size(candidate: Candidate, values: FloatArray) -> Estimate:
-    """An estimate with given coefficients and no evidence yet."""
-    nothing = SelectedEffect(candidate, (), 1.0, 0.0, 0.0, ())
-    return Estimate(nothing, candidate, values, np.zeros((len(values), len(values))))
-
-
-def _gauss_newton_step(at: Residuals, columns: FloatArray, precision: FloatArray, values: FloatArray) -> FloatArray:
-    """Return the change (k,) of coefficients `values` in a Gauss-Newton step with free pose and prior `precision` (k,)."""
-    design = np.concatenate([at.pose_jacobian, columns], axis=1) / at.sigma[:, None]
-    known, pull = np.zeros(design.shape[1]), np.zeros(design.shape[1])
-    start = at.pose_jacobian.shape[1]
-    known[start:], pull[start:] = precision, precision * values
-    found = np.linalg.solve(design.T @ design + np.diag(known), design.T @ (at.value / at.sigma) - pull)
-    return np.asarray(found[start:])
-
-
 def _strongest_single_fits(given: SearchInput, first: MeanSearch, together: list[SelectedEffect]) -> list[_SingleFit]:
     """The effects that alone explain most, refitted without linearising, best first.
 
@@ -314,6 +298,13 @@ def _strongest_single_fits(given: SearchInput, first: MeanSearch, together: list
         return []
     likeliest = _best_variants(given, first, found)
     return _with_alternatives(given, first, likeliest, set(likeliest[0].estimate.chosen.indistinguishable))
+
+
+def _screened_single_fits(given: SearchInput, first: MeanSearch, alone: list[_SingleFit]) -> list[_SingleFit]:
+    """Add single fits of the effects that leave the least noise if each is in the model without linearising; best first."""
+    ranked = rank_by_noise_left(given.measurement, given.part, first.effect_variants())[:_MOST_CONVERGED]
+    more = [each for each in (_single_fit(given, first, candidate) for candidate in ranked) if each is not None]
+    return _ranked_on_common_points([*alone, *_best_variants(given, first, more)], first) if more else alone
 
 
 def _with_alternatives(given: SearchInput, first: MeanSearch, alone: list[_SingleFit], names: set[str]) -> list[_SingleFit]:

@@ -97,12 +97,9 @@ def validate_effects(
 
 
 def _is_weak(item: NamedEffect) -> bool:
-    """Whether an effect beside others is not significant.
-
-    This is so if its log-likelihood ratio g is at most its standard error sqrt(2 g), or if the effect is consistent with zero.
-    """
-    by = thresholds().validation
-    return item.kind == "physical" and item.effect.scored() and (item.gain <= by.least_gain or _is_consistent_with_zero(item))
+    """Whether an effect beside others gains too little to be named, or is consistent with zero."""
+    least = thresholds().variance.least_gain
+    return item.kind == "physical" and item.effect.scored() and (item.gain <= least or _is_consistent_with_zero(item))
 
 
 def describe_weakness(item: NamedEffect) -> str:
@@ -196,10 +193,7 @@ def _gain_needed(expected: float) -> float:
     The gain of a true effect, half a difference of two chi^2, has a variance of about twice its expectation.
     """
     likely = max(expected, 0.0)
-    return max(
-        min(0.0, likely - thresholds().verdict.gap_sigmas * float(np.sqrt(2 * likely))),
-        -thresholds().validation.least_gain,
-    )
+    return min(0.0, likely - thresholds().verdict.gap_sigmas * float(np.sqrt(2 * likely)))
 
 
 def _registered_residuals(

@@ -33,7 +33,7 @@ STILL_OVERDISPERSED = (
     "Effects were named, but with them the residuals still vary far more than the model predicts, and nothing explains it."
 )
 STILL_REJECTED = (
-    "Effects were named, but the model is rejected with them too, and the gap is too small to show that they close any of it."
+    "Effects were named, but the model is rejected with them too, and the validation points do not show that the gap is smaller."
 )
 UNSUPPORTED = "Effects were named, but the gap is no smaller with them, and the misfit was not tested: nothing supports them."
 PARTLY_EXPLAINED = (
@@ -114,12 +114,15 @@ class Evidence:
 
     @property
     def misfit_stays(self) -> bool:
-        """Whether nothing shows that the named effects help: the remaining misfit is significant, and the gap is too uncertain.
+        """Whether nothing shows that the named effects help: the remaining misfit is significant, and they close no gap for sure.
 
-        The gap is how much worse the model predicts validation points than noise explains; too uncertain, it does not tell
-        whether the effects close it.
+        The gap is how much worse the model predicts validation points than noise explains. It may be too uncertain to tell
+        whether the effects close it, or the score with them may be better by no more than the uncertainty.
         """
-        return self.misfit_is_significant and self.gap is not None and self.gap.closed is None
+        gap = self.gap
+        if gap is None or not self.misfit_is_significant:
+            return False
+        return gap.closed is None or gap.before - gap.after <= thresholds().verdict.gap_sigmas * gap.error
 
     @property
     def effects_unsupported(self) -> bool:
