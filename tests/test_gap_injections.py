@@ -12,7 +12,7 @@ from numpy.testing import assert_allclose
 
 from benchmarks.gap_injections import bases, cases, formulas, run
 from benchmarks.gap_injections.formulas import Matched, Optics, Scan, in_raster, matched, scanned
-from benchmarks.gap_injections.score import SIZES, scored
+from benchmarks.gap_injections.score import SIZES, BeforeInjection, scored
 
 RNG = np.random.default_rng(0)
 REAL = pytest.mark.skipif(not bases.DATA.exists(), reason="the shared data are not here")
@@ -111,9 +111,29 @@ def test_answers_are_scored_by_name_and_size(effects: Any, expected: str) -> Non
 
 
 def test_what_was_there_before_is_not_blamed_on_the_injection() -> None:
-    both = answer("range_offset", OFFSET, said("range_offset", "offset_m", 0.01, 1e-4), said("wobble", "amplitude_rad", 1.0, 0.1))
-    assert scored(both, frozenset(["wobble"]))["judgement"] == "right"
-    assert scored(both, frozenset(["collimation"]))["judgement"] == "wrong"
+    wobble = said("wobble", "amplitude_rad", 1.0, 0.1)
+    both = answer("range_offset", OFFSET, said("range_offset", "offset_m", 0.01, 1e-4), wobble)
+    assert scored(both, BeforeInjection({"wobble": wobble}))["judgement"] == "right"
+    assert scored(both, BeforeInjection({"collimation": wobble}))["judgement"] == "wrong"
+
+
+def test_what_was_there_before_adds_to_the_injection() -> None:
+    found = answer("range_offset", OFFSET, said("range_offset", "offset_m", 0.03, 1e-4))
+    assert scored(found)["judgement"] == "size"
+    assert scored(found, BeforeInjection({"range_offset": said("range_offset", "offset_m", 0.02, 1e-4)}))["judgement"] == "right"
+
+
+@pytest.mark.parametrize(("factor", "expected"), [(1.0, "size"), (1.5, "right")])
+def test_noise_that_the_model_lacked_before_adds_to_the_injection(factor: float, expected: str) -> None:
+    found = answer("range_noise", {"sigma_m": 0.02}, said("range_noise", "sigma_m", 0.03, 1e-4))
+    assert scored(found, BeforeInjection(missing_noise=factor))["judgement"] == expected
+
+
+def test_noises_of_other_exponents_are_compared_at_one_intensity() -> None:
+    injected = {"a_m": 0.03 * 201.0**0.7, "exponent": -0.7}
+    found = said("range_noise_intensity", "a_m", 0.03 * 201.0**0.5, 1e-4)
+    found["parameters"]["exponent"] = {"value": -0.5, "std": None}
+    assert scored(answer("range_noise_intensity", injected, found))["judgement"] == "right"
 
 
 def test_what_is_in_no_catalogue_is_right_where_nothing_is_blamed() -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from benchmarks.gap_injections.formulas import Values
+from benchmarks.gap_injections.score import INTENSITY
 
 
 @dataclass(frozen=True)
@@ -81,7 +82,7 @@ _ROCKS: list[tuple[str, str, Values]] = [
     ("rocks", "range_incidence_bias", {"coefficient_m": 4e-2}),
     ("rocks", "range_noise", {"sigma_m": 3e-2}),
     ("rocks", "range_noise", {"sigma_m": 8e-2}),
-    ("rocks", "range_noise_intensity", {"a_m": 3e-2 * 201**0.7, "exponent": -0.7}),
+    ("rocks", "range_noise_intensity", {"a_m": 3e-2 * INTENSITY**0.7, "exponent": -0.7}),
     ("rocks", "trunnion_tilt", {"angle_rad": 5e-3}),
     ("rocks", "vertical_index", {"offset_rad": 2e-3}),
     ("rocks", "off_jump", {"size_m": 3e-2}),

@@ -45,6 +45,9 @@ _RULES = """These rules apply:
   stand beside the injected one.
 - **The size is right** within 3 standard errors or 15 % of the injected value, and the period of a wave within 5 %. Other
   parameters are not checked.
+- **What the measurement lacks before** adds to the injection, and that sum is right too. An effect that the diagnosis names
+  without the injection adds to an injected one of the same name. Noise adds as variance: the residuals before may scatter more
+  or less than the model predicts. A noise that falls with the intensity is compared at an intensity of 201.
 - **The verdict** does not count for effects of the catalogue.
 - **Errors outside the catalogue** (`off_...`) are *right* if the verdict is `unknown` and no new effect is named, *wrong* if
   a new effect is named, and *missed* otherwise."""

@@ -27,7 +27,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 from benchmarks.gap_injections.bases import BASES
 from benchmarks.gap_injections.cases import CASES, Case
 from benchmarks.gap_injections.page import page
-from benchmarks.gap_injections.score import Json, scored
+from benchmarks.gap_injections.score import BeforeInjection, Json, scored
 from pipeline.change.robust import nmad
 from pipeline.formats.measurements.measurement import read_measurement
 from pipeline.gap.naming.workflow import GapDiagnosis, diagnose
@@ -146,11 +146,24 @@ def answered(case: Case, out: Path) -> Json:
     return found
 
 
-def named_before(base: str, out: Path) -> frozenset[str]:
-    """Return effects of the catalogue that the unchanged measurement is said to have."""
-    found = json.loads((out / "answers" / f"{base}.json").read_text())
+def before_injection(case: Case, out: Path) -> BeforeInjection:
+    """Return what is known of the measurement of a case without the injection."""
+    found = json.loads((out / "answers" / f"{case.base}.json").read_text())
     last = found.get("as_diagnosed", found["as_it_is"])
-    return frozenset(each["name"].partition(".")[2] for each in last["effects"] if each["kind"] == "physical")
+    effects = {each["name"].partition(".")[2]: each for each in last["effects"] if each["kind"] == "physical"}
+    return BeforeInjection(effects, missing_noise(case, out) if "noise" in case.effect else 1.0)
+
+
+def missing_noise(case: Case, out: Path) -> float:
+    """Return the factor on an injected noise that makes the model's noise that of the measurement.
+
+    The injection adds the variance after - before, in units of the predicted one, but the model lacks after - 1.
+    """
+    before, after = (registered_residuals(out / part) for part in (Path("bases") / case.base, Path("cases") / case.name))
+    there = after.values_at(after.value, before.index)
+    used = before.usable & np.isfinite(there)
+    was, now = (nmad((value / before.sigma)[used]) ** 2 for value in (before.value, there))
+    return float(np.sqrt(max(now - 1, 0.0) / (now - was))) if now > was else 1.0
 
 
 def _write(path: Path, values: Any) -> None:
@@ -162,7 +175,7 @@ def run(out: Path, cases: tuple[Case, ...] = CASES) -> list[Json]:
     """Return the scored answers to all cases."""
     found = []
     for case in cases:
-        row = scored(answered(case, out), named_before(case.base, out))
+        row = scored(answered(case, out), before_injection(case, out))
         print(f"{case.name} {case.base} {case.effect} {row['judgement']}: {row['verdict']} {row['named']}", flush=True)
         found.append(row)
     return found
