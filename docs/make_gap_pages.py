@@ -347,15 +347,15 @@ def verdicts() -> dict[str, Verdict]:
             "The model is rejected, but the catalogue does not explain why. There are three cases, and the report begins with "
             "another sentence in each:\n\n"
             "1. *An empirical term describes the misfit.* A curve of one covariate, such as the azimuth or the time, explains "
-            "clearly more (a penalised log-likelihood ratio higher by 5) than any effect of the catalogue. The report says the "
+            "clearly more (a penalised log-likelihood ratio higher by 6) than any effect of the catalogue. The report says the "
             "sentence above. If effects of the catalogue are named beside the curve, it says instead: \"" + PARTLY_EXPLAINED
             + "\"\n"
             "2. *Nothing describes it.* Nothing that was tried passes the test on validation blocks, although the gap exceeds "
             "the floor by more than its uncertainty, or the misfit has a p-value of at most 0.01. The report says: \""
             + NOT_DESCRIBED + "\" It also says where the misfit is and how large.\n"
             "3. *The named effects do not help enough.* They leave most of the gap open. Or they leave a misfit with a p-value "
-            "of at most 0.01, and the gap is so small that one cannot tell how much of it they close. The report says, for "
-            "example: \"" + STILL_OPEN + "\"",
+            "of at most 0.01, and the score on validation blocks does not show that they make the gap smaller. The report says, "
+            "for example: \"" + STILL_OPEN + "\"",
             "See in the report on which covariate the disagreement depends, and in what form. In case 1, model_after.yaml holds "
             "the empirical term, which reproduces the disagreement in simulations, but only within the measured range of the "
             "covariate (`along`, in the unit of the covariate: rad for angles). In case 2 it holds no further effect, in case 3 "
