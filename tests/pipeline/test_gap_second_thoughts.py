@@ -225,48 +225,6 @@ def test_a_low_pass_that_others_feign_takes_no_outlines_along(monkeypatch: pytes
     assert best_pass(starts, KeyedRandom(1), frozenset()).edge_effect_names == {"edge_fattening"}
 
 
-@pytest.mark.parametrize(
-    ("smooth", "spreads", "expected"),
-    [
-        ((0, 1), 1.0, {"with_edge_effects", "without_edge_effects"}),
-        ((0, 1), 2.0, {"with_edge_effects", "without_edge_effects", "at_initial_pose"}),
-        ((1, 2), 1.0, {"with_edge_effects", "without_edge_effects", "at_initial_pose"}),
-    ],
-)
-def test_a_low_pass_is_tried_where_the_sensor_stays_unless_one_effect_explains_all(
-    monkeypatch: pytest.MonkeyPatch, smooth: tuple[int, int], spreads: float, expected: set[str]
-) -> None:
-    """The search at the initial pose is skipped if a single effect explains the residuals.
-
-    This must need no larger standard deviation; the simplest result wins.
-    """
-    asked: dict[str, tuple[tuple[int, int], float]] = {
-        "with_edge_effects": ((1, 3), 1.0),
-        "without_edge_effects": (smooth, spreads),
-        "at_initial_pose": ((0, 2), 1.0),
-    }
-    tried = []
-
-    def named(_: Any, state: str, *_given: Any) -> Any:
-        tried.append(state)
-        complexity, wide = asked[state]
-        shapes = set() if state == "without_edge_effects" else {"smoothing"}
-        return SimpleNamespace(
-            named=["effect"],
-            edge_effect_names=shapes,
-            complexity=complexity,
-            selection=SimpleNamespace(noise_ratio=wide),
-            state=state,
-        )
-
-    monkeypatch.setattr(SelectionPass, "of", classmethod(named))
-    seen = [EdgeEffect(Smoothing(sigma_px=2.0), {}, 50.0, np.zeros(1, dtype=bool))]
-    starts: Any = SimpleNamespace(**{name: name for name in asked}, edge_effects_given=lambda _: seen, with_these=lambda _: None)
-    found = best_pass(starts, KeyedRandom(1), frozenset())
-    assert set(tried) == expected
-    assert found.complexity == min(asked[name][0] for name in expected if asked[name][1] < 2)
-
-
 def test_an_unknown_without_a_name_says_what_remains_is_most_like() -> None:
     """The note names the largest form that was tried, except steps at a place, with its size.
 

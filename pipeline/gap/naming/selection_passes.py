@@ -15,7 +15,7 @@ from pipeline.gap.naming.named_effects import NamedEffect, aligned_with, effect_
 from pipeline.gap.noise_and_edges.beam_footprint import find_footprint
 from pipeline.gap.noise_and_edges.disparity_edges import find_disparity_edge_effects
 from pipeline.gap.noise_and_edges.edge_effects import EdgeEffect
-from pipeline.gap.residuals.alignment import align, compute_residuals, fit_pose_robustly
+from pipeline.gap.residuals.alignment import align, fit_pose_robustly
 from pipeline.gap.residuals.residuals import BoolArray, Residuals
 from pipeline.gap.residuals.scene_changes import SceneChange, drop_duplicates, find_scene_changes
 from pipeline.gap.residuals.sensor_view import SensorView
@@ -68,14 +68,7 @@ class PassInput:
     training_rows: NDArray[np.int64]
 
     @classmethod
-    def of(
-        cls,
-        aligned: Measurement,
-        plain: Residuals,
-        held_out_points: BoolArray,
-        edge_effects: list[EdgeEffect],
-        realigned: bool = True,
-    ) -> PassInput:
+    def of(cls, aligned: Measurement, plain: Residuals, held_out_points: BoolArray, edge_effects: list[EdgeEffect]) -> PassInput:
         """Build the input of one run of the search for sensor errors, with certain edge effects in the sensor model.
 
         Edge effects are errors at depth steps: edge fattening, smoothing, filled occlusions and the beam footprint. Regions
@@ -87,10 +80,9 @@ class PassInput:
         plain : its residuals without edge effects.
         held_out_points : (N,) true for points that are kept for validation.
         edge_effects : edge effects to put into the model. Their attribute `touched` must have a value for each of the N points.
-        realigned : true: the pose is estimated again with the edge effects in the model; false: the pose of `aligned` is kept.
         """
         touched = np.any([np.zeros(len(plain), dtype=bool), *(each.touched[plain.index] for each in edge_effects)], axis=0)
-        registration_rows = plain.index[~(touched | held_out_points[plain.index])] if realigned else None
+        registration_rows = plain.index[~(touched | held_out_points[plain.index])]
         modelled, residuals = _with_edge_effects(aligned, plain, edge_effects, touched, registration_rows)
         registered_residuals, _, noise_ratio = fit_pose_robustly(residuals)
         sight = SensorView.of(aligned, residuals)
@@ -232,15 +224,6 @@ class PassInputs:
         return self.with_these(self._edge_effects)
 
     @cached_property
-    def at_initial_pose(self) -> PassInput:
-        """Input of the search for sensor errors with all edge effects that the residuals show, at the initial pose.
-
-        Edge effects are errors at depth steps. The initial pose was estimated without them. It is tried too because one of
-        them, smoothing by the stereo matcher, can shift a pose that is estimated with it.
-        """
-        return PassInput.of(self.measurement, self.plain, self.held_out_points, self._edge_effects, realigned=False)
-
-    @cached_property
     def without_edge_effects(self) -> PassInput:
         """Input of the search for sensor errors without any effect at depth steps (such as edge fattening) in the model."""
         return self.with_these([])
@@ -269,9 +252,9 @@ def best_pass(inputs: PassInputs, random: KeyedRandom, excluded: frozenset[tuple
     """Run the search for sensor errors with several inputs and return the simplest run that explains the residuals.
 
     The inputs differ in the edge effects (errors at depth steps) in the sensor model, because other errors can hide or imitate
-    them. Up to three runs are made: with the edge effects that the residuals show; without any; and, if smoothing is among them
-    and may have shifted the estimated pose, at the initial pose. After each run, edge effects are searched again with the named
-    errors in the model; if others show, the run is repeated with them.
+    them. A run is made with the edge effects that the residuals show, and another one without any if a single error does not
+    suffice. After each run, edge effects are searched again with the named errors in the model; if others show, the run is
+    repeated with them.
 
     Among the runs whose noise is close to the lowest, the one with the fewest empirical terms wins, then the one with the
     fewest errors. The noise is compared because enough noise can take the place of any error.
@@ -300,9 +283,6 @@ def best_pass(inputs: PassInputs, random: KeyedRandom, excluded: frozenset[tuple
         without = SelectionPass.of(inputs.without_edge_effects, random, excluded)
         if without.named:
             found.append(search_edges_again(without))
-    simple = found[-1].complexity <= _LEAST_COMPLEXITY and found[-1].selection.noise_ratio <= found[0].selection.noise_ratio
-    if Smoothing.tag() in first.edge_effect_names and found[0].complexity >= (1, 0) and not simple:
-        found.insert(1, search_edges_again(SelectionPass.of(inputs.at_initial_pose, random, excluded)))
     most_noise = thresholds().verdict.overdispersion * min(each.selection.noise_ratio for each in found)
     return min((each for each in found if each.selection.noise_ratio <= most_noise), key=lambda each: each.complexity)
 
@@ -345,21 +325,18 @@ def _with_edge_effects(
     residuals: Residuals,
     edge_effects: list[EdgeEffect],
     touched: BoolArray,
-    registration_rows: NDArray[np.int64] | None,
+    registration_rows: NDArray[np.int64],
 ) -> tuple[Measurement, Residuals]:
     """Put edge effects into the model and return the measurement with the residuals of the same points.
 
-    The pose is estimated again from `registration_rows`, rows of the measurement's points; None keeps it. touched: (n,) points
+    The pose is estimated again from `registration_rows`, rows of the measurement's points. touched: (n,) points
     that the effects move, which then do not count as smooth.
     """
     if not edge_effects:
         return measurement, residuals
     entries = [effect_from_edges(shape).entry for shape in edge_effects]
     modelled = measurement.changed(model=with_effects(measurement.model, entries))
-    if registration_rows is None:
-        found = compute_residuals(modelled)
-    else:
-        modelled, found, _ = align(modelled, registration_rows)
+    modelled, found, _ = align(modelled, registration_rows)
     place = np.full(len(measurement.cloud.points), -1)
     place[found.index] = np.arange(len(found))
     rows = place[residuals.index]
