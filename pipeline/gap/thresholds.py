@@ -223,9 +223,8 @@ class VerdictThresholds(ThresholdGroup):
     gap_sigmas: PositiveFloat = threshold_field(
         2.0,
         "standard errors",
-        "The scores before and after differ if their difference exceeds this. An effect that lowers the log score of the "
-        "validation blocks still passes if it is within this of the gain that the training blocks predict. Beside others, an "
-        "effect whose only parameter is within this of zero is only mentioned.",
+        "The scores before and after differ if their difference exceeds this. Beside others, an effect whose only parameter is "
+        "within this of zero is only mentioned.",
         JUDGEMENT,
     )
 

@@ -120,7 +120,7 @@ class Effect(Config, ABC):
     shared : bool
         For noise: whether neighbouring pixels have similar errors.
     held_out_gain : float
-        Increase of the log score on validation data above which `scarpsim gap` accepts the effect; 0: the usual threshold.
+        Increase of the log score on validation data above which `scarpsim gap` accepts the effect.
     """
 
     name: str

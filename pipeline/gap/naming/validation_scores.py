@@ -62,7 +62,7 @@ def validate_effects(
     Returns
     -------
     ValidatedEffects : accepted effects; failed ones, which do not improve the likelihood; and weak ones, which improve it, but
-        not significantly (their ratio is within its standard error, or their size within its uncertainty of zero).
+        too little to be named beside others (`variance.least_gain`), or whose size is within its uncertainty of zero.
     """
     scorable = [item for item in named if item.effect.scored()]
     if not scorable or (~training).sum() < 100:
@@ -71,27 +71,21 @@ def validate_effects(
     shared = float(np.mean(residuals.with_sigma_of_means.sigma**2 - residuals.sigma**2)) / _POINTS_PER_PATCH
     patch_sigma = float(np.sqrt(reference_sigma**2 + shared))
 
-    def gains(out: list[NamedEffect]) -> tuple[float, float]:
-        """Validation gain of some effects, and the gain expected from the training points."""
+    def gain(out: list[NamedEffect]) -> float:
+        """Validation gain of some effects."""
         without = _registered_residuals(measurement, [each for each in named if each not in out], residuals, training)
         known = np.isfinite(with_all.value) & np.isfinite(without.value)
-        tested, learned = (
-            _log_score_gain(with_all, without, known & rows, residuals.wall_xy, patch_sigma) for rows in (~training, training)
-        )
-        return tested, learned * float(np.sum(known & ~training)) / max(float(np.sum(known & training)), 1.0)
+        return _log_score_gain(with_all, without, known & ~training, residuals.wall_xy, patch_sigma)
 
-    found = {item.name: gains([item]) for item in scorable}
+    found = {item.name: gain([item]) for item in scorable}
     systematic = [item for item in scorable if not item.adds_variance]
-    if len(systematic) > 1:
-        tested, expected = gains(systematic)
-        if tested <= _gain_needed(expected):
-            out = min(systematic, key=lambda item: (item.kind != "empirical", found[item.name][0]))
-            left = validate_effects(
-                measurement, residuals, [each for each in named if each is not out], training, reference_sigma
-            )
-            return ValidatedEffects(left.named, [out, *left.failed], left.weak)
-    failed = [item for item in scorable if found[item.name][0] <= _gain_needed_by(item, found[item.name][1])]
-    measured = [replace(item, gain=found[item.name][0]) if item.name in found else item for item in named if item not in failed]
+    if len(systematic) > 1 and gain(systematic) <= 0:
+        out = min(systematic, key=lambda item: (item.kind != "empirical", found[item.name]))
+        rest = [each for each in named if each is not out]
+        left = validate_effects(measurement, residuals, rest, training, reference_sigma)
+        return ValidatedEffects(left.named, [out, *left.failed], left.weak)
+    failed = [item for item in scorable if found[item.name] <= item.effect.held_out_gain]
+    measured = [replace(item, gain=found[item.name]) if item.name in found else item for item in named if item not in failed]
     weak = [item for item in measured if _is_weak(item)] if len(measured) > 1 else []
     return ValidatedEffects([item for item in measured if item not in weak], failed, weak)
 
@@ -119,11 +113,6 @@ def _is_consistent_with_zero(item: NamedEffect) -> bool:
         return False
     ((value, std),) = values
     return abs(value) < thresholds().verdict.gap_sigmas * std
-
-
-def _gain_needed_by(item: NamedEffect, expected: float) -> float:
-    """Return the validation gain that an effect must exceed; some effects have a limit of their own."""
-    return item.effect.held_out_gain or _gain_needed(expected)
 
 
 @dataclass(frozen=True)
@@ -185,15 +174,6 @@ def _inliers(found: _RegisteredResiduals) -> BoolArray:
     """(n,) residuals that are no outliers. Debris or a fallen block would move the mean of a patch."""
     z = found.value / found.sigma
     return np.asarray(np.abs(z) < thresholds().points.outlier_sigmas * max(nmad(z), 1.0))
-
-
-def _gain_needed(expected: float) -> float:
-    """The gain at or below which an effect fails: zero, or less where little is expected, as chance may take that much.
-
-    The gain of a true effect, half a difference of two chi^2, has a variance of about twice its expectation.
-    """
-    likely = max(expected, 0.0)
-    return min(0.0, likely - thresholds().verdict.gap_sigmas * float(np.sqrt(2 * likely)))
 
 
 def _registered_residuals(
