@@ -26,6 +26,7 @@ from pipeline.gap.naming.effect_screening import rank_by_noise_left
 from pipeline.gap.naming.named_effects import NamedEffect, effect_from_estimate
 from pipeline.gap.naming.nonlinear_refit import (
     SearchInput,
+    _screened_single_fits,
     _strongest_single_fits,
     _with_equivalence_class,
     fit_jointly,
@@ -162,6 +163,9 @@ def test_the_class_of_an_effect_taken_exactly_is_by_exact_likelihoods(
     """
     points, _ = turned_and_zoomed
     first = MeanSearch(with_fitted_variance(points.part, [], 1.0), points.families, KeyedRandom(1))
+    screened = _screened_single_fits(points, first, _strongest_single_fits(points, first, first.select()[0]))
+    assert len({each.name for each in screened}) == len(screened)
+    assert [each.score for each in screened] == sorted((each.score for each in screened), reverse=True)
     classes = {}
     for margin in (0.0, 1e9):
         monkeypatch.setattr(nonlinear_refit, "equivalence_margin", lambda _, margin=margin: margin)

@@ -300,8 +300,10 @@ class MeanSearch:
         Of the variants of one error in one camera, the one that explains most stands for all. Sines of unknown period are not
         included.
         """
-        ranked = [each for _, each in reversed(self._ranked_variants())]
-        return list({(each.name, each.fixed.get("camera")): each for each in ranked}.values())
+        best: dict[tuple[str, float | str | None], Candidate] = {}
+        for _, each in self._ranked_variants():
+            best.setdefault((each.name, each.fixed.get("camera")), each)
+        return list(best.values())
 
     def leading_effects(self) -> list[Candidate]:
         """List the sensor errors that explain the most on their own, which are worth refitting without linearisation.

@@ -301,10 +301,18 @@ def _strongest_single_fits(given: SearchInput, first: MeanSearch, together: list
 
 
 def _screened_single_fits(given: SearchInput, first: MeanSearch, alone: list[_SingleFit]) -> list[_SingleFit]:
-    """Add single fits of the effects that leave the least noise if each is in the model without linearising; best first."""
+    """Add single fits of the effects that leave the least noise if each is in the model without linearising.
+
+    Of each effect the best fit is kept; best first.
+    """
     ranked = rank_by_noise_left(given.measurement, given.part, first.effect_variants())[:_MOST_CONVERGED]
     more = [each for each in (_single_fit(given, first, candidate) for candidate in ranked) if each is not None]
-    return _ranked_on_common_points([*alone, *_best_variants(given, first, more)], first) if more else alone
+    if not more:
+        return alone
+    best: dict[str, _SingleFit] = {}
+    for each in _ranked_on_common_points([*alone, *_best_variants(given, first, more)], first):
+        best.setdefault(each.name, each)
+    return list(best.values())
 
 
 def _with_alternatives(given: SearchInput, first: MeanSearch, alone: list[_SingleFit], names: set[str]) -> list[_SingleFit]:
