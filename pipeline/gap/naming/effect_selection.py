@@ -40,7 +40,7 @@ from pipeline.gap.noise_and_edges.grid_noise import find_grid_noise, separate_wh
 from pipeline.gap.noise_and_edges.noise_power import detectable_noise
 from pipeline.gap.noise_and_edges.pixel_locking import NoiseBounds, find_locking
 from pipeline.gap.noise_and_edges.rounded_ranges import find_range_step
-from pipeline.gap.noise_and_edges.tile_seams import find_tile_seams
+from pipeline.gap.noise_and_edges.tile_seams import detectable_tile_shift, find_tile_seams
 from pipeline.gap.noise_and_edges.variance_model import NoiseRatio, VarianceScore, VarianceTerm, fit_variance_model
 from pipeline.gap.residuals.alignment import at_points_of, fit_pose_robustly
 from pipeline.gap.residuals.residuals import Residuals
@@ -275,7 +275,8 @@ def _detectable_sizes(
     members = [each.candidate for each in found.further]
     systematic = found.search.detectable_sizes(members, found.tried, random.child("power"))
     noise = detectable_noise(found.residuals, found.search.design.cells, left, noise_terms, random)
-    return (*systematic, *noise)
+    tiles = [detectable_tile_shift(found.residuals, left)] if isinstance(found.residuals, StereoResiduals) else []
+    return (*systematic, *tiles, *noise)
 
 
 def _explains_everything(found: SearchOutcome) -> bool:

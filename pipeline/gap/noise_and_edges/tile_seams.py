@@ -13,11 +13,13 @@ from numpy.typing import NDArray
 from scipy.stats import norm
 
 from pipeline.change.robust import nmad
+from pipeline.gap.mean.detection_power import DetectableSize
 from pipeline.gap.residuals.disparity_raster import raster_cell_px
 from pipeline.gap.residuals.residuals import BoolArray
 from pipeline.gap.residuals.stereo_residuals import StereoResiduals
 from pipeline.gap.thresholds import thresholds
 from scene.geometry.mesh import FloatArray
+from sensors.effects.tile_shift import TileShift
 
 _SMALLEST_CELLS, _LARGEST_SHARE = 4.0, 0.5
 """Smallest side of a tile, cells of the raster, and largest, share of the image's width."""
@@ -25,6 +27,8 @@ _SHARE_OF_CELL = 0.25
 """Share of a cell by which the last seam of neighbouring trials differs."""
 _CLIP_SIGMAS = 4.0
 """Standard deviations at which differences are clipped, because of depth steps."""
+_POWER = 0.95
+"""Probability with which a shift of the detectable size is found."""
 _AT_ONCE, _REFINED = 512, 201
 """Sides that are tried together, and sides that are tried around the best one."""
 
@@ -77,6 +81,41 @@ class _SeamDifferences:
         return float(np.sum(self.value**2) / max(self.known.sum(), 1))
 
 
+@dataclass(frozen=True)
+class _SeamTest:
+    """Differences of neighbouring cells of a raster, and the sides of a tile to try.
+
+    Attributes
+    ----------
+    u, v : (columns,) and (rows,) coordinates of the raster's columns and rows, px.
+    across, down : differences along rows and along columns.
+    sides : (k,) sides of a tile, px.
+    """
+
+    u: FloatArray
+    v: FloatArray
+    across: _SeamDifferences
+    down: _SeamDifferences
+    sides: FloatArray
+
+    @classmethod
+    def of(cls, residuals: StereoResiduals, registered_residuals: FloatArray) -> _SeamTest | None:
+        """Prepare the test; None if the points lie on no raster, or on one that is too small for tiles."""
+        at = residuals.geometry
+        step = raster_cell_px(at.u, at.v)
+        if step is None:
+            return None
+        (u, column), (v, row) = (_axis(x, step) for x in (at.u, at.v))
+        raster = np.full((len(v), len(u)), np.nan)
+        raster[row, column] = registered_residuals
+        found = cls(u, v, _SeamDifferences.of(raster, 1), _SeamDifferences.of(raster, 0), _sides(u, v, step))
+        return found if len(found.sides) and found.across.variance and found.down.variance else None
+
+    def trials(self, sides: FloatArray) -> _TileTrials:
+        """Evaluate sides of a tile (k,), px."""
+        return _TileTrials.of(sides, self.u, self.v, self.across, self.down)
+
+
 def find_tile_seams(residuals: StereoResiduals, registered_residuals: FloatArray) -> TileSeams | None:
     """Find image tiles that a stereo matcher processed separately and shifted against each other.
 
@@ -91,24 +130,17 @@ def find_tile_seams(residuals: StereoResiduals, registered_residuals: FloatArray
     -------
     TileSeams or None : the tiles; None if none are significant, or if the points lie on no pixel raster.
     """
-    at = residuals.geometry
-    step = raster_cell_px(at.u, at.v)
-    if step is None:
+    test = _SeamTest.of(residuals, registered_residuals)
+    if test is None:
         return None
-    (u, column), (v, row) = (_axis(x, step) for x in (at.u, at.v))
-    raster = np.full((len(v), len(u)), np.nan)
-    raster[row, column] = registered_residuals
-    across, down = _SeamDifferences.of(raster, 1), _SeamDifferences.of(raster, 0)
-    sides = _sides(u, v, step)
-    if not len(sides) or not across.variance or not down.variance:
-        return None
-    trials = [_TileTrials.of(part, u, v, across, down) for part in np.array_split(sides, -(-len(sides) // _AT_ONCE))]
+    sides = test.sides
+    trials = [test.trials(part) for part in np.array_split(sides, -(-len(sides) // _AT_ONCE))]
     coarse = max(trials, key=lambda each: abs(each.sigmas[each.best]))
     p_value = min(2 * len(sides) * float(norm.sf(abs(coarse.sigmas[coarse.best]))), 1.0)
     if p_value > thresholds().locking.significance:
         return None
     reach = 2 * float(sides[1] / sides[0] - 1)
-    found = _TileTrials.of(coarse.sides[coarse.best] * np.linspace(1 - reach, 1 + reach, _REFINED), u, v, across, down)
+    found = test.trials(coarse.sides[coarse.best] * np.linspace(1 - reach, 1 + reach, _REFINED))
     sigmas, information = float(found.sigmas[found.best]), float(found.information[found.best])
     near = found.sides[np.abs(found.sigmas) > abs(sigmas) - 1]
     return TileSeams(
@@ -119,6 +151,31 @@ def find_tile_seams(residuals: StereoResiduals, registered_residuals: FloatArray
         0.5 * sigmas**2,
         p_value,
     )
+
+
+def detectable_tile_shift(residuals: StereoResiduals, registered_residuals: FloatArray) -> DetectableSize:
+    """Compute how far tiles would have to be shifted to be found in a measurement with a probability of 95 %.
+
+    It holds for a side in the middle of those that are tried; smaller tiles have more seams and show sooner.
+
+    Parameters
+    ----------
+    residuals : disparity residuals of n points with their pixels, px.
+    registered_residuals : (n,) these residuals after a robust pose fit, px, in which no tiles were found.
+
+    Returns
+    -------
+    DetectableSize : the amplitude, px; NaN with a note if the points lie on no pixel raster.
+    """
+    name, test = TileShift.tag(), _SeamTest.of(residuals, registered_residuals)
+    if test is None:
+        return DetectableSize(
+            name, "", np.nan, note="the points lie on no raster of pixels, so seams between tiles cannot be seen"
+        )
+    side = test.sides[len(test.sides) // 2]
+    needed = float(norm.isf(thresholds().locking.significance / (2 * len(test.sides)))) + float(norm.ppf(_POWER))
+    size = needed / float(np.sqrt(test.trials(np.array([side])).information[0]))
+    return DetectableSize(name, "amplitude_px", size, {"tile_px": float(side)})
 
 
 @dataclass(frozen=True)
