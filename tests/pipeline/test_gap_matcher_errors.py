@@ -17,6 +17,7 @@ from pipeline.gap.mean.candidates import Candidate
 from pipeline.gap.mean.search import MeanSearch
 from pipeline.gap.naming.candidate_families import catalogue_families
 from pipeline.gap.naming.named_effects import within_bounds
+from pipeline.gap.naming.selection_passes import PassInputs, SelectionPass
 from pipeline.gap.noise_and_edges.disparity_edges import align_beside_fattening, find_disparity_edge_effects
 from pipeline.gap.residuals.alignment import align, compute_residuals, fit_pose_robustly
 from pipeline.gap.residuals.disparity_raster import raster_cell_px
@@ -70,6 +71,11 @@ def test_a_window_that_takes_the_nearest_rock_is_found_beside_its_pose(
     assert named.effect.window == "square"
     assert named.effect.step_px == pytest.approx(step_px, rel=0.25)
     assert named.effect.radius_px == pytest.approx(cells * step, abs=2 * named.std["radius_px"])
+    inputs = PassInputs(found.measurement, found.residuals, np.zeros(len(there.cloud.points), dtype=bool))
+    selection: Any = None
+    (again,) = inputs.edge_effects_given(SelectionPass(inputs.with_these(inputs._edge_effects), [], selection))
+    assert isinstance(again.effect, EdgeFattening)
+    assert (again.effect.window, again.effect.radius_px) == ("square", named.effect.radius_px), "it starts from the first pose"
 
 
 @pytest.mark.parametrize(("seed", "share", "along"), [(2, 0.6, False), (3, 0.4, True)])

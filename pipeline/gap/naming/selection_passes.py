@@ -15,7 +15,7 @@ from pipeline.gap.naming.named_effects import NamedEffect, aligned_with, effect_
 from pipeline.gap.noise_and_edges.beam_footprint import find_footprint
 from pipeline.gap.noise_and_edges.disparity_edges import find_disparity_edge_effects
 from pipeline.gap.noise_and_edges.edge_effects import EdgeEffect
-from pipeline.gap.residuals.alignment import align, fit_pose_robustly
+from pipeline.gap.residuals.alignment import align, compute_residuals, fit_pose_robustly
 from pipeline.gap.residuals.residuals import BoolArray, Residuals
 from pipeline.gap.residuals.scene_changes import SceneChange, drop_duplicates, find_scene_changes
 from pipeline.gap.residuals.sensor_view import SensorView
@@ -228,17 +228,21 @@ class PassInputs:
         """Input of the search for sensor errors without any effect at depth steps (such as edge fattening) in the model."""
         return self.with_these([])
 
-    def edge_effects_given(self, named: list[NamedEffect]) -> list[EdgeEffect]:
+    def edge_effects_given(self, found: SelectionPass) -> list[EdgeEffect]:
         """Search effects at depth steps (edge effects) again, with other errors in the model that can hide or imitate them.
 
-        named: sensor errors that a search found, to put into the model first.
+        The pose is estimated with the edge effects of the first search in the model too, because edge fattening shifts it.
+
+        found: a run of the search, with the sensor errors to put into the model first.
 
         Returns
         -------
         list : the edge effects that the residuals then show.
         """
-        seen = aligned_with(self.measurement, named, self.plain.index[~self.held_out_points[self.plain.index]])
-        return _find_edge_effects(seen.measurement, seen.residuals, self.held_out_points)
+        known = [*found.named, *map(effect_from_edges, found.pass_input.edge_effects)]
+        posed = aligned_with(self.measurement, known, self.plain.index[~self.held_out_points[self.plain.index]]).measurement
+        seen = posed.changed(model=with_effects(self.measurement.model, [item.entry for item in found.named]))
+        return _find_edge_effects(seen, compute_residuals(seen), self.held_out_points)
 
     def with_these(self, edge_effects: list[EdgeEffect]) -> PassInput:
         """Return the input of a search for sensor errors with the given effects at depth steps in the sensor model.
@@ -272,7 +276,7 @@ def best_pass(inputs: PassInputs, random: KeyedRandom, excluded: frozenset[tuple
             return found
         # a small error of the rays' directions looks like smoothing
         imitated = {Smoothing.tag()} - found.edge_effect_names
-        edge_effects = [each for each in inputs.edge_effects_given(found.named) if each.name not in imitated]
+        edge_effects = [each for each in inputs.edge_effects_given(found) if each.name not in imitated]
         if {each.name for each in edge_effects} == found.edge_effect_names:
             return found
         return SelectionPass.of(inputs.with_these(edge_effects), random, excluded)
