@@ -149,8 +149,8 @@ def answered(case: Case, out: Path) -> Json:
 def before_injection(case: Case, out: Path) -> BeforeInjection:
     """Return what is known of the measurement of a case without the injection."""
     found = json.loads((out / "answers" / f"{case.base}.json").read_text())
-    last = found.get("as_diagnosed", found["as_it_is"])
-    effects = {each["name"].partition(".")[2]: each for each in last["effects"] if each["kind"] == "physical"}
+    said = [each for answer in (found["as_it_is"], found.get("as_diagnosed", {"effects": []})) for each in answer["effects"]]
+    effects = {each["name"].partition(".")[2]: each for each in said if each["kind"] == "physical"}
     return BeforeInjection(effects, missing_noise(case, out) if "noise" in case.effect else 1.0)
 
 
