@@ -8,7 +8,8 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks.gap_closed_form.score import score
-from benchmarks.gap_injections.run import named_before
+from benchmarks.gap_injections.cases import Case
+from benchmarks.gap_injections.run import before_injection
 from benchmarks.gap_injections.score import scored
 from benchmarks.gap_second_generator.score import RIGHT, outcome
 
@@ -44,7 +45,7 @@ class StoredCase:
         if self.source == "injections":
             stored = json.loads((self.runs / "answers" / f"{self.name}.json").read_text())
             asked = {**answer, "case": stored["case"], "strength": stored["strength"]}
-            found = scored(asked, named_before(stored["case"]["base"], self.runs))["judgement"]
+            found = scored(asked, before_injection(Case(**stored["case"]), self.runs))["judgement"]
             return "" if found in ("right", "class") else str(found)
         truth_file = self.folder / "truth.json" if self.source == "given" else self.runs / "truth" / f"{self.name}.json"
         truth = json.loads(truth_file.read_text())

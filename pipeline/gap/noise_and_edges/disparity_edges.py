@@ -380,24 +380,28 @@ def most_likely_fattening(data: _EdgeData) -> EdgeFattening:
         step = at.likeliest_step(trial(window, radius, _WINDOW_STEPS_PX[0]))
         return [] if step is None else [trial(window, radius, step)]
 
+    def refined(best: EdgeFattening) -> EdgeFattening:
+        for factor in _STEP_FACTORS:
+            radius = int(best.radius_px / cell)
+            radii = [each for each in (radius - 1, radius, radius + 1) if each]
+            if best.window == "rim":
+                tried = [max(best.step_px, smallest) * factor**power for power in range(-3, 4)]
+                trials = [trial("rim", each, step) for each in radii for step in tried if step >= smallest]
+            else:
+                registered = data.registered_with(best)
+                trials = [each for radius in radii for each in with_best_step(registered, best.window, radius)]
+            best = most_likely([best, *trials])
+        return best
+
     rim = (0.0, *(height * smallest for height in _RIM_STEPS))
-    steps = {"rim": rim, **dict.fromkeys(_WINDOWS, _WINDOW_STEPS_PX)}
-    trials = [trial(window, radius, step) for window, tried in steps.items() for step in tried for radius in _RADII]
-    trials += [each for window in _WINDOWS for radius in _RADII for each in with_best_step(data, window, radius)]
-    best = most_likely(trials)
+    best_of_each = [most_likely([trial("rim", radius, step) for step in rim for radius in _RADII])]
+    for window in _WINDOWS:
+        trials = [trial(window, radius, step) for step in _WINDOW_STEPS_PX for radius in _RADII]
+        best_of_each.append(most_likely(trials + [each for radius in _RADII for each in with_best_step(data, window, radius)]))
+    best = most_likely(best_of_each)
     if data.registered_density([best]).sum() <= data.registered_density_without.sum():
         return best
-    for factor in _STEP_FACTORS:
-        radius = int(best.radius_px / cell)
-        radii = [each for each in (radius - 1, radius, radius + 1) if each]
-        if best.window == "rim":
-            tried = [max(best.step_px, smallest) * factor**power for power in range(-3, 4)]
-            trials = [trial("rim", each, step) for each in radii for step in tried if step >= smallest]
-        else:
-            registered = data.registered_with(best)
-            trials = [each for radius in radii for each in with_best_step(registered, best.window, radius)]
-        best = most_likely([best, *trials])
-    return best
+    return most_likely([refined(each) for each in best_of_each])
 
 
 def _find_smoothing(data: _EdgeData) -> EdgeEffect | None:
