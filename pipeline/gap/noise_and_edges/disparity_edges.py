@@ -36,6 +36,8 @@ _SIGMAS = (0.5, 0.7, 1.0, 1.4, 2.0, 2.8, 4.0, 5.6, 8.0, 11.0)
 standard deviations of the low-pass, cells."""
 _REFINEMENT_FACTORS = (1.1, 1.03)
 _WINDOWS = ("disc", "square")
+_LARGEST_STEP_PX = 1000.0
+"""Largest depth step that the effect accepts, px."""
 _STEP_FACTORS = (1.2, 1.05)
 """Ratios of neighbouring steps in the refinements of a rim's step."""
 _ROUNDED_CELLS = 0.25, 1.5 / np.sqrt(12)
@@ -160,7 +162,7 @@ class _EdgeData:
             return None
         last = int(np.argmax(total))
         lower = shift[order[last + 1]] if last + 1 < len(order) else window.step_px
-        return float((shift[order[last]] + lower) / 2)
+        return float(min((shift[order[last]] + lower) / 2, _LARGEST_STEP_PX))
 
     def edge_effect(self, effect: Effect, std: dict[str, float], gain: float) -> EdgeEffect:
         """Return the result for an effect that was accepted beside the known ones."""
