@@ -147,7 +147,7 @@ def answered(case: Case, out: Path) -> Json:
 
 
 def before_injection(case: Case, out: Path) -> BeforeInjection:
-    """Return what is known of the measurement of a case without the injection."""
+    """Return the effects and the noise that the measurement of a case had before the injection."""
     found = json.loads((out / "answers" / f"{case.base}.json").read_text())
     said = [each for answer in (found["as_it_is"], found.get("as_diagnosed", {"effects": []})) for each in answer["effects"]]
     effects = {each["name"].partition(".")[2]: each for each in said if each["kind"] == "physical"}
@@ -155,7 +155,7 @@ def before_injection(case: Case, out: Path) -> BeforeInjection:
 
 
 def missing_noise(case: Case, out: Path) -> float:
-    """Return the factor on an injected noise that makes the model's noise that of the measurement.
+    """Return by how much to multiply an injected noise, so that model and measurement have the same noise with it.
 
     The injection adds the variance after - before, in units of the predicted one, but the model lacks after - 1.
     """

@@ -27,7 +27,7 @@ _SIGMAS, _SHARE = 3.0, 0.15
 
 @dataclass(frozen=True)
 class BeforeInjection:
-    """What is known of a measurement without the injected effect.
+    """Effects and noise that a measurement had before an effect was injected.
 
     Attributes
     ----------

@@ -1,4 +1,4 @@
-"""Rank effects of the catalogue by the noise that each alone leaves, without linearising, on few of the points."""
+"""Rank effects by how small the residuals become with each alone in the sensor model, without linearising."""
 
 from __future__ import annotations
 
@@ -15,7 +15,8 @@ from pipeline.gap.residuals.alignment import fit_pose_robustly
 from pipeline.gap.residuals.residuals import Residuals
 from scene.geometry.mesh import FloatArray
 
-_MOST_POINTS = 3_000
+_FEWEST_POINTS = 3_000
+"""Points of the subsample: at least this many, if there are so many, and less than twice as many. They suffice for a ranking."""
 
 
 def gauss_newton_step(at: Residuals, columns: FloatArray, precision: FloatArray, values: FloatArray) -> FloatArray:
@@ -53,7 +54,7 @@ def estimate_of_size(candidate: Candidate, values: FloatArray) -> Estimate:
 
 
 def rank_by_noise_left(measurement: Measurement, part: Residuals, candidates: Sequence[Candidate]) -> list[Candidate]:
-    """Rank sensor errors (effects) by the noise that each alone leaves if it is put into the sensor model.
+    """Rank sensor errors (effects) by how small the residuals become when each is put into the sensor model alone.
 
     A linearised model ranks effects wrongly if the error is so large that rays meet other parts of a rough wall. Here each
     effect gets its size by one Gauss-Newton step, the pose is estimated again with it, and residuals are computed anew. At most
@@ -69,7 +70,7 @@ def rank_by_noise_left(measurement: Measurement, part: Residuals, candidates: Se
     -------
     list : the effects with plausible sizes, the one that leaves the smallest median absolute residual first.
     """
-    rows = np.arange(0, len(part), max(len(part) // _MOST_POINTS, 1))
+    rows = np.arange(0, len(part), max(len(part) // _FEWEST_POINTS, 1))
     few = part.part(rows)
     points = measurement.part(few.index)
     few = replace(few, index=np.arange(len(rows)))

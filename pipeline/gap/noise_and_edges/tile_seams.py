@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from scipy.stats import norm
 
 from pipeline.change.robust import nmad
-from pipeline.gap.mean.detection_power import DetectableSize
+from pipeline.gap.mean.detection_power import POWER, DetectableSize
 from pipeline.gap.residuals.disparity_raster import raster_cell_px
 from pipeline.gap.residuals.residuals import BoolArray
 from pipeline.gap.residuals.stereo_residuals import StereoResiduals
@@ -27,8 +27,6 @@ _SHARE_OF_CELL = 0.25
 """Share of a cell by which the last seam of neighbouring trials differs."""
 _CLIP_SIGMAS = 4.0
 """Standard deviations at which differences are clipped, because of depth steps."""
-_POWER = 0.95
-"""Probability with which a shift of the detectable size is found."""
 _AT_ONCE, _REFINED = 512, 201
 """Sides that are tried together, and sides that are tried around the best one."""
 
@@ -83,7 +81,7 @@ class _SeamDifferences:
 
 @dataclass(frozen=True)
 class _SeamTest:
-    """Differences of neighbouring cells of a raster, and the sides of a tile to try.
+    """Input of the test for shifted tiles: differences of neighbouring cells of a raster, and the sides of a tile to try.
 
     Attributes
     ----------
@@ -173,7 +171,7 @@ def detectable_tile_shift(residuals: StereoResiduals, registered_residuals: Floa
             name, "", np.nan, note="the points lie on no raster of pixels, so seams between tiles cannot be seen"
         )
     side = test.sides[len(test.sides) // 2]
-    needed = float(norm.isf(thresholds().locking.significance / (2 * len(test.sides)))) + float(norm.ppf(_POWER))
+    needed = float(norm.isf(thresholds().locking.significance / (2 * len(test.sides)))) + float(norm.ppf(POWER))
     size = needed / float(np.sqrt(test.trials(np.array([side])).information[0]))
     return DetectableSize(name, "amplitude_px", size, {"tile_px": float(side)})
 
