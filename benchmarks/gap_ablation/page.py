@@ -155,7 +155,7 @@ def _flips(results: Json) -> str:
 _PAGE = """# What `gap` needs its thresholds for
 
 This page is for developers of `scarpsim gap`. It shows for each threshold what the diagnosis loses without the rule behind
-it, and which thresholds were deleted or merged therefore: of {before}, {after} are left. [What each threshold
+it, and which thresholds were deleted or merged therefore: there were {before}, now there are {after}. [What each threshold
 does](gap_thresholds.md) says how far answers depend on the value of a threshold, and what each decides.
 
 Each case was diagnosed with the usual thresholds, which named a wrong effect, missed one or gave a false alarm in {wrong}

@@ -41,6 +41,7 @@ OFF: dict[str, float] = {
     "changes.faint_sigmas": LARGE,
     "changes.margin": 0.0,
     "changes.moved_share": LARGE,
+    "verdict.block_p": 1.0,
     "verdict.least_closed": -LARGE,
     "verdict.overdispersion": LARGE,
 }

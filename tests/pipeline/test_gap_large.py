@@ -287,27 +287,29 @@ def test_an_effect_that_is_not_there_fails_on_blocks_that_were_held_out(tmp_path
     """The ranges grow with the incidence angle; a scale error of nine parts in 10,000 is also named, but is not there."""
     write_scan(tmp_path, 8, ranges=lambda scan: scan.R + 0.01 * (1 / scan.cos_i - 1), step_rad=0.007)
     there, residuals, _ = align(read_measurement(tmp_path))
-    trained = ~in_validation_blocks(residuals.wall_xy, WallCells.over(residuals.wall_xy).side_m)
+    side_m = WallCells.over(residuals.wall_xy).side_m
+    trained = ~in_validation_blocks(residuals.wall_xy, side_m)
     true, wrong = (
         NamedEffect(f"tls.{name}", "physical", {"name": name, key: value}, {}, (), 0.001, 10.0)
         for name, key, value in (("range_incidence_bias", "coefficient_m", 0.01), ("range_scale", "scale_ppm", 900.0))
     )
-    scored = validate_effects(there, residuals, [wrong, true], trained, 0.0004)
+    scored = validate_effects(there, residuals, [wrong, true], trained, 0.0004, side_m)
     assert [item.name for item in scored.failed] == ["tls.range_scale"]
     assert [item.name for item in scored.named] == ["tls.range_incidence_bias"]
     assert scored.named[0].gain > 50
 
 
-def test_an_effect_that_gains_no_more_than_its_standard_error_is_only_mentioned_beside_others(tmp_path: Path) -> None:
+def test_an_effect_from_which_few_blocks_gain_is_only_mentioned_beside_others(tmp_path: Path) -> None:
     """The ranges grow with the incidence angle; a scale error of 1 ppm, which cannot be told from zero, is also named."""
     write_scan(tmp_path, 8, ranges=lambda scan: scan.R + 0.01 * (1 / scan.cos_i - 1), step_rad=0.007)
     there, residuals, _ = align(read_measurement(tmp_path))
-    trained = ~in_validation_blocks(residuals.wall_xy, WallCells.over(residuals.wall_xy).side_m)
+    side_m = WallCells.over(residuals.wall_xy).side_m
+    trained = ~in_validation_blocks(residuals.wall_xy, side_m)
     true, slight = (
         NamedEffect(f"tls.{name}", "physical", {"name": name, key: value}, {}, (), 0.001, 10.0)
         for name, key, value in (("range_incidence_bias", "coefficient_m", 0.01), ("range_scale", "scale_ppm", 1.0))
     )
-    both = validate_effects(there, residuals, [true, slight], trained, 0.0004)
+    both = validate_effects(there, residuals, [true, slight], trained, 0.0004, side_m)
     assert [item.name for item in both.named] == ["tls.range_incidence_bias"]
     assert [item.name for item in both.weak] == ["tls.range_scale"]
     assert 0 < both.weak[0].gain < 2

@@ -23,7 +23,7 @@ from pipeline.gap.naming import workflow
 from pipeline.gap.naming.effect_selection import NONPARAMETRIC_TERMS, _note_most_similar
 from pipeline.gap.naming.gap_score import simulate_errors
 from pipeline.gap.naming.named_effects import NamedEffect, with_effects
-from pipeline.gap.naming.selection_passes import PassInput, PassInputs, SelectionPass, best_pass
+from pipeline.gap.naming.selection_passes import PassInput, PassInputs, SelectionPass, select_beside_edge_effects
 from pipeline.gap.naming.validation import Validation, ValidationResult
 from pipeline.gap.naming.validation_scores import ValidatedEffects
 from pipeline.gap.noise_and_edges.edge_effects import EdgeEffect
@@ -86,7 +86,7 @@ def test_where_a_free_form_fails_all_is_named_again_without_any(
         failed = [item for item in items if item.kind == "empirical"]
         return ValidatedEffects([item for item in items if item not in failed], failed, [])
 
-    monkeypatch.setattr(workflow, "best_pass", named)
+    monkeypatch.setattr(workflow, "select_beside_edge_effects", named)
     monkeypatch.setattr(workflow, "validate_effects", scored)
     monkeypatch.setattr(workflow, "only_within_bounds", lambda _, items: (items, []))
     monkeypatch.setattr(workflow, "_with_heavy_tails", lambda *given: (given[1], None))
@@ -215,14 +215,11 @@ def test_a_low_pass_that_others_feign_takes_no_outlines_along(monkeypatch: pytes
     seen = [EdgeEffect(effect, {}, 50.0, nowhere) for effect in (EdgeFattening(radius_px=3.0), Smoothing(sigma_px=2.0))]
 
     def named(_: Any, state: list[EdgeEffect], *_given: Any) -> Any:
-        selection = SimpleNamespace(noise_ratio=1.0)
-        return SimpleNamespace(
-            named=["noise"], edge_effect_names={each.name for each in state}, complexity=(0, len(state)), selection=selection
-        )
+        return SimpleNamespace(named=["noise"], edge_effect_names={each.name for each in state})
 
     monkeypatch.setattr(SelectionPass, "of", classmethod(named))
-    starts: Any = SimpleNamespace(with_edge_effects=[], edge_effects_given=lambda _: seen, with_these=lambda effects: effects)
-    assert best_pass(starts, KeyedRandom(1), frozenset()).edge_effect_names == {"edge_fattening"}
+    starts: Any = SimpleNamespace(edge_effects=list, edge_effects_given=lambda _: seen, with_these=lambda effects: effects)
+    assert select_beside_edge_effects(starts, KeyedRandom(1), frozenset()).edge_effect_names == {"edge_fattening"}
 
 
 def test_an_unknown_without_a_name_says_what_remains_is_most_like() -> None:

@@ -16,7 +16,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from copy import copy
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from itertools import product
 
@@ -405,17 +405,12 @@ class _NormalEquations:
 
     def log_likelihood(self, at: CellCovariance) -> float:
         """Log-likelihood of the fit of all columns."""
-        matrix, right, constant = self._equations(at)
+        matrix, right, constant = self.equations(at)
         scale = _scale(matrix)
         found = dsysv(_regularised(matrix, scale), scale * right)[2]
         return constant + 0.5 * float(right @ (scale * found))
 
-    def at(self, at: CellCovariance, precision: FloatArray | None = None) -> MeanFit:
-        """Fit all columns under one covariance. `precision`: (k, k) prior inverse covariance of the coefficients."""
-        matrix, right, constant = self._equations(at)
-        return _solve(matrix if precision is None else matrix + precision, right, constant, at)
-
-    def _equations(self, at: CellCovariance) -> tuple[FloatArray, FloatArray, float]:
+    def equations(self, at: CellCovariance) -> tuple[FloatArray, FloatArray, float]:
         """Matrix (k, k), right side (k,), and the log-likelihood without any column."""
         root = np.sqrt(at.weight)
         basis, y = self.columns.between[at.basis] * root[:, None], self.value.between[at.basis][:, 0] * root
@@ -445,14 +440,20 @@ def fit_reml(
     known.
     """
     normal = _NormalEquations.of(columns, value)
-    fits = [normal.at(each, precision) for each in covariances]
-    likelihood = np.array([fit.log_likelihood + 0.5 * np.linalg.slogdet(fit.covariance)[1] for fit in fits])
-    best = fits[int(np.argmax(likelihood))]
+    matrices, rights, constants = map(np.stack, zip(*map(normal.equations, covariances), strict=True))
+    if precision is not None:
+        matrices = matrices + precision
+    scales = _scale(matrices)
+    inverses = np.linalg.inv(_regularised(matrices, scales)) * (scales[:, :, None] * scales[:, None, :])
+    coefficients = np.einsum("fij,fj->fi", inverses, rights)
+    log_likelihoods = constants + 0.5 * np.sum(rights * coefficients, axis=1)
+    likelihood = log_likelihoods + 0.5 * np.linalg.slogdet(inverses)[1]
+    best = int(np.argmax(likelihood))
     weights = np.exp(likelihood - likelihood.max())
     weights /= weights.sum()
-    moves = np.stack([fit.coefficients - best.coefficients for fit in fits])
-    covariance = np.einsum("f,fij->ij", weights, np.stack([fit.covariance for fit in fits]))
-    return replace(best, covariance=covariance + np.einsum("f,fi,fj->ij", weights, moves, moves))
+    moves = coefficients - coefficients[best]
+    covariance = np.einsum("f,fij->ij", weights, inverses) + np.einsum("f,fi,fj->ij", weights, moves, moves)
+    return MeanFit(coefficients[best], covariance, float(log_likelihoods[best]), covariances[best])
 
 
 def _maximum(heights: Sequence[Callable[[], float]]) -> tuple[int, float]:
@@ -465,20 +466,12 @@ def _maximum(heights: Sequence[Callable[[], float]]) -> tuple[int, float]:
     return top, found[top]
 
 
-def _solve(matrix: FloatArray, right: FloatArray, constant: float, at: CellCovariance) -> MeanFit:
-    """Solve normal equations."""
-    scale = _scale(matrix)
-    inverse = np.linalg.inv(_regularised(matrix, scale)) * np.outer(scale, scale)
-    coefficients = inverse @ right
-    return MeanFit(coefficients, inverse, constant + 0.5 * float(right @ coefficients), at)
-
-
 def _scale(matrix: FloatArray) -> FloatArray:
-    """(k,) factors that scale columns to size 1; 0 for absent ones."""
-    size = np.sqrt(np.diag(matrix))
-    return np.divide(1.0, size, out=np.zeros_like(size), where=size > _NOTHING * size.max())
+    """(..., k) factors that scale the columns of normal equations (..., k, k) to size 1; 0 for absent ones."""
+    size = np.sqrt(np.diagonal(matrix, axis1=-2, axis2=-1))
+    return np.divide(1.0, size, out=np.zeros_like(size), where=size > _NOTHING * size.max(axis=-1, keepdims=True))
 
 
 def _regularised(matrix: FloatArray, scale: FloatArray) -> FloatArray:
-    """Scaled matrix with a small ridge."""
-    return matrix * np.outer(scale, scale) + _RIDGE * np.eye(len(scale))
+    """Scaled normal equations (..., k, k) with a small ridge."""
+    return np.asarray(matrix * (scale[..., :, None] * scale[..., None, :]) + _RIDGE * np.eye(scale.shape[-1]))

@@ -80,8 +80,8 @@ class SelectionResult:
     identifiability : table with three keys: `names` of the effects; `cosines` between their signatures, the patterns of
         residuals that they make; and `survival`, the share of each signature that is left after the sensor's pose is fitted.
     reference_sigma : standard deviation of the error of the reference surface, in the unit of the observable (m or px).
-    noise_ratio : observed over predicted standard deviation of the residuals after the systematic effects.
-    detectable : for each effect that was not found, the size at which it would have been found with a probability of 95 %.
+    detectable : function that computes, for each effect that was not found, the size at which it would have been found with a
+        probability of 95 %.
     p_value_beside : function that computes the p-value of the misfit beside some of the selected systematic effects, given by
         their names. It repeats the search with them in the model, and returns None if it cannot.
     """
@@ -95,8 +95,7 @@ class SelectionResult:
     notes: tuple[str, ...]
     identifiability: dict[str, Any]
     reference_sigma: float
-    noise_ratio: float
-    detectable: tuple[DetectableSize, ...]
+    detectable: Callable[[], tuple[DetectableSize, ...]]
     p_value_beside: Callable[[frozenset[str]], float | None] = lambda _: None
 
     def p_value_given(self, named: Sequence[NamedEffect]) -> float | None:
@@ -232,7 +231,6 @@ def select_effects(
     tried = found.chosen[0].family_scores if found.chosen else found.tried
     without_nulls = tuple(item for item in tried if not item.name.startswith(SPATIAL_NULL))
     sigma = design.reference_sigma([each.candidate for each in found.further])
-    noise_ratio_left = nmad(left / found.residuals.sigma, 0.0)
     result = SelectionResult(
         without_nulls,
         tuple(variance_tried),
@@ -243,8 +241,7 @@ def select_effects(
         notes,
         table,
         sigma,
-        noise_ratio_left,
-        _detectable_sizes(found, [each.effect for each in noise_terms], left, random),
+        lambda: _detectable_sizes(found, [each.effect for each in noise_terms], left, random),
         lambda kept: _p_value_beside(points, found, kept),
     )
     angles = [each for each in systematic if each.effect is AngleEmpirical]

@@ -1,9 +1,8 @@
-"""Selection passes: the input of a pass after edge effects, the effects that it selects, and the choice between passes."""
+"""Selection passes: the input of a pass after edge effects, and the effects that it selects."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,8 +27,6 @@ from scene.geometry.mesh import FloatArray
 from sensors.effects.beam_divergence import BeamDivergence
 from sensors.effects.smoothing import Smoothing
 
-_LEAST_COMPLEXITY = 0, 1
-"""Complexity (empirical terms, all effects) of a pass that selects one effect of the catalogue and nothing else."""
 _MOST_POINTS = 60_000
 """Most points that a selection uses; more add little information to about 800 cells."""
 
@@ -145,7 +142,7 @@ class PassInput:
 
 @dataclass(frozen=True)
 class SelectionPass:
-    """One run of the search for sensor errors, with its input and its result; several runs with different inputs are compared.
+    """One run of the search for sensor errors, with its input and its result.
 
     Attributes
     ----------
@@ -179,25 +176,13 @@ class SelectionPass:
         """
         return {each.name for each in self.pass_input.edge_effects}
 
-    @property
-    def complexity(self) -> tuple[int, int]:
-        """How complex the result of a search for sensor errors is: two numbers, to prefer the simplest of several results.
-
-        The first is the number of empirical terms (which name no cause). The second is the number of all errors, those at
-        depth steps included, plus that of the scene changes. Pairs are compared in this order; the smaller is the simpler result.
-        """
-        given = self.pass_input
-        return sum(item.kind == "empirical" for item in self.named), len(self.named) + len(given.edge_effects) + len(
-            given.changes
-        )
-
 
 @dataclass(frozen=True, eq=False)
 class PassInputs:
-    """Makes alternative inputs of a search for sensor errors: with all edge effects that were found, with some, or none.
+    """Makes inputs of a search for sensor errors, which differ in the edge effects that are in the sensor model.
 
     Edge effects are errors at depth steps: edge fattening, smoothing, filled occlusions and the beam footprint. Other errors
-    can hide or imitate them, so the search is run with several of these inputs.
+    can hide or imitate them, so they are searched again beside the errors that a search has named.
 
     Attributes
     ----------
@@ -210,23 +195,9 @@ class PassInputs:
     plain: Residuals
     held_out_points: BoolArray
 
-    @cached_property
-    def _edge_effects(self) -> list[EdgeEffect]:
-        """The edge effects that show in the plain residuals."""
+    def edge_effects(self) -> list[EdgeEffect]:
+        """Find the effects at depth steps (edge effects) that the residuals show without any other error in the model."""
         return _find_edge_effects(self.measurement, self.plain, self.held_out_points)
-
-    @cached_property
-    def with_edge_effects(self) -> PassInput:
-        """Input of the search for sensor errors with all effects at depth steps (edge effects) that the residuals show.
-
-        The sensor's pose is estimated again with these in the model.
-        """
-        return self.with_these(self._edge_effects)
-
-    @cached_property
-    def without_edge_effects(self) -> PassInput:
-        """Input of the search for sensor errors without any effect at depth steps (such as edge fattening) in the model."""
-        return self.with_these([])
 
     def edge_effects_given(self, found: SelectionPass) -> list[EdgeEffect]:
         """Search effects at depth steps (edge effects) again, with other errors in the model that can hide or imitate them.
@@ -252,43 +223,27 @@ class PassInputs:
         return PassInput.of(self.measurement, self.plain, self.held_out_points, edge_effects)
 
 
-def best_pass(inputs: PassInputs, random: KeyedRandom, excluded: frozenset[tuple[str, bool]]) -> SelectionPass:
-    """Run the search for sensor errors with several inputs and return the simplest run that explains the residuals.
+def select_beside_edge_effects(inputs: PassInputs, random: KeyedRandom, excluded: frozenset[tuple[str, bool]]) -> SelectionPass:
+    """Search for sensor errors beside the effects at depth steps (edge effects) that the residuals show.
 
-    The inputs differ in the edge effects (errors at depth steps) in the sensor model, because other errors can hide or imitate
-    them. A run is made with the edge effects that the residuals show, and another one without any if a single error does not
-    suffice. After each run, edge effects are searched again with the named errors in the model; if others show, the run is
-    repeated with them.
-
-    Among the runs whose noise is close to the lowest, the one with the fewest empirical terms wins, then the one with the
-    fewest errors. The noise is compared because enough noise can take the place of any error.
+    Other errors can hide or imitate edge effects. These are therefore searched again with the named errors in the model; if
+    others show then, the search for errors is repeated beside them.
 
     Parameters
     ----------
-    inputs : inputs to choose from.
+    inputs : makes the input of a search with given edge effects.
     random : source of random numbers for the null distributions.
     excluded : sensor errors that are not tried, as pairs (name, whether it is an empirical term).
     """
-
-    def search_edges_again(found: SelectionPass) -> SelectionPass:
-        """Repeat the pass beside the edge effects that show once the named effects are in the model."""
-        if not found.named:
-            return found
-        # a small error of the rays' directions looks like smoothing
-        imitated = {Smoothing.tag()} - found.edge_effect_names
-        edge_effects = [each for each in inputs.edge_effects_given(found) if each.name not in imitated]
-        if {each.name for each in edge_effects} == found.edge_effect_names:
-            return found
-        return SelectionPass.of(inputs.with_these(edge_effects), random, excluded)
-
-    first = SelectionPass.of(inputs.with_edge_effects, random, excluded)
-    found = [search_edges_again(first)]
-    if first.edge_effect_names and found[0].complexity > _LEAST_COMPLEXITY:
-        without = SelectionPass.of(inputs.without_edge_effects, random, excluded)
-        if without.named:
-            found.append(search_edges_again(without))
-    most_noise = thresholds().verdict.overdispersion * min(each.selection.noise_ratio for each in found)
-    return min((each for each in found if each.selection.noise_ratio <= most_noise), key=lambda each: each.complexity)
+    found = SelectionPass.of(inputs.with_these(inputs.edge_effects()), random, excluded)
+    if not found.named:
+        return found
+    # a small error of the rays' directions looks like smoothing
+    imitated = {Smoothing.tag()} - found.edge_effect_names
+    edge_effects = [each for each in inputs.edge_effects_given(found) if each.name not in imitated]
+    if {each.name for each in edge_effects} == found.edge_effect_names:
+        return found
+    return SelectionPass.of(inputs.with_these(edge_effects), random, excluded)
 
 
 def subsample_rows(rows: NDArray[np.int64]) -> NDArray[np.int64]:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import combinations
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,17 +15,21 @@ from pipeline.change.robust import nmad
 from pipeline.formats.measurements.measurement import Measurement
 from pipeline.gap.mean.within_cell_noise import inverse_from_cholesky
 from pipeline.gap.naming.named_effects import NamedEffect, aligned_with
+from pipeline.gap.noise_and_edges.sign_flips import DRAWS
 from pipeline.gap.residuals.alignment import fit_pose
 from pipeline.gap.residuals.correlated_noise import GridCorrelatedNoise
 from pipeline.gap.residuals.residuals import BoolArray, Residuals
-from pipeline.gap.residuals.wall_blocks import wall_blocks_by_points
+from pipeline.gap.residuals.wall_blocks import wall_block_numbers, wall_blocks_by_points
 from pipeline.gap.thresholds import thresholds
+from scene.common.keyed_random import KeyedRandom
 from scene.geometry.mesh import FloatArray
 from sensors.effects.base import ShowsIn
 
 _POINTS_PER_PATCH = 30.0
 _LEAST_WHITE_SHARE = 0.02
 """Least share of a point's variance that counts as white noise, where the model has correlated noise only."""
+_ROUNDING = 1e-9
+"""Relative rounding error of a sum."""
 
 
 @dataclass(frozen=True)
@@ -34,7 +40,7 @@ class ValidatedEffects:
     ----------
     named : effects that improve the predictions; the gain of each is its log-likelihood ratio on these parts.
     failed : effects that do not improve them.
-    weak : effects that improve them, but by less than an effect must to be reported by name.
+    weak : effects that improve them on the whole, but not in enough of the parts to be reported by name.
     """
 
     named: list[NamedEffect]
@@ -43,13 +49,19 @@ class ValidatedEffects:
 
 
 def validate_effects(
-    measurement: Measurement, residuals: Residuals, named: list[NamedEffect], training: BoolArray, reference_sigma: float
+    measurement: Measurement,
+    residuals: Residuals,
+    named: list[NamedEffect],
+    training: BoolArray,
+    reference_sigma: float,
+    side_m: float,
 ) -> ValidatedEffects:
     """Test whether each named effect (sensor error) improves the likelihood of parts of the wall that no fit used.
 
     The model with all effects is compared with the model without the tested one. Two systematic effects may only compensate each
-    other, and then each seems to be needed. Therefore all systematic effects are first tested together. If they fail, the one
-    with the smallest log-likelihood ratio is removed, an empirical term before any other, and the test is repeated with the rest.
+    other, and then each seems to be needed. Therefore all systematic effects are first tested together, and then each two of
+    them. If a group fails, the one with the smallest log-likelihood ratio is removed, an empirical term before any other, and
+    the test is repeated with the rest.
 
     Parameters
     ----------
@@ -58,11 +70,14 @@ def validate_effects(
     named : effects to validate.
     training : (n,) true for points from which the pose is estimated; the other points, the validation points, are scored.
     reference_sigma : standard deviation of the error of the reference surface, in the unit of the observable (m or px).
+    side_m : a third of the side of a wall block, m. A wall block is a large square of the wall, and is used as a whole for
+        fits or for validation.
 
     Returns
     -------
     ValidatedEffects : accepted effects; failed ones, which do not improve the likelihood; and weak ones, which improve it, but
-        too little to be named beside others (`variance.least_gain`), or whose size is within its uncertainty of zero.
+        too little to be named beside others: the wall blocks do not agree on it (`verdict.block_p`), or the effect's size is
+        within its uncertainty of zero.
     """
     scorable = [item for item in named if item.effect.scored()]
     if not scorable or (~training).sum() < 100:
@@ -70,40 +85,60 @@ def validate_effects(
     with_all = _registered_residuals(measurement, named, residuals, training)
     shared = float(np.mean(residuals.with_sigma_of_means.sigma**2 - residuals.sigma**2)) / _POINTS_PER_PATCH
     patch_sigma = float(np.sqrt(reference_sigma**2 + shared))
+    block = wall_block_numbers(residuals.wall_xy, side_m)
 
-    def gain(out: list[NamedEffect]) -> float:
-        """Validation gain of some effects."""
+    def gains(out: Sequence[NamedEffect]) -> FloatArray:
+        """Validation gain of some effects in each wall block."""
         without = _registered_residuals(measurement, [each for each in named if each not in out], residuals, training)
         known = np.isfinite(with_all.value) & np.isfinite(without.value)
-        return _log_score_gain(with_all, without, known & ~training, residuals.wall_xy, patch_sigma)
+        return _log_score_gains(with_all, without, known & ~training, residuals.wall_xy, block, patch_sigma)
 
-    found = {item.name: gain([item]) for item in scorable}
+    found = {item.name: gains([item]) for item in scorable}
+    total = {name: float(each.sum()) for name, each in found.items()}
     systematic = [item for item in scorable if not item.adds_variance]
-    if len(systematic) > 1 and gain(systematic) <= 0:
-        out = min(systematic, key=lambda item: (item.kind != "empirical", found[item.name]))
-        rest = [each for each in named if each is not out]
-        left = validate_effects(measurement, residuals, rest, training, reference_sigma)
-        return ValidatedEffects(left.named, [out, *left.failed], left.weak)
-    failed = [item for item in scorable if found[item.name] <= item.effect.held_out_gain]
-    measured = [replace(item, gain=found[item.name]) if item.name in found else item for item in named if item not in failed]
-    weak = [item for item in measured if _is_weak(item)] if len(measured) > 1 else []
+    pairs = [*combinations(systematic, 2)]
+    groups = [systematic, *pairs] if len(pairs) > 1 else pairs
+    for group in groups:
+        if gains(group).sum() <= 0:
+            out = min(group, key=lambda item: (item.kind != "empirical", total[item.name]))
+            rest = [each for each in named if each is not out]
+            left = validate_effects(measurement, residuals, rest, training, reference_sigma, side_m)
+            return ValidatedEffects(left.named, [out, *left.failed], left.weak)
+    failed = [item for item in scorable if total[item.name] <= item.effect.held_out_gain]
+    measured = [replace(item, gain=total[item.name]) if item.name in total else item for item in named if item not in failed]
+    weak = [item for item in measured if _is_weak(item, found.get(item.name))] if len(measured) > 1 else []
     return ValidatedEffects([item for item in measured if item not in weak], failed, weak)
 
 
-def _is_weak(item: NamedEffect) -> bool:
-    """Whether an effect beside others gains too little to be named, or is consistent with zero."""
-    least = thresholds().variance.least_gain
-    return item.kind == "physical" and item.effect.scored() and (item.gain <= least or _is_consistent_with_zero(item))
+def _is_weak(item: NamedEffect, gains: FloatArray | None) -> bool:
+    """Whether the wall blocks do not agree that an effect beside others improves the predictions, or its size may be zero."""
+    if item.kind != "physical" or gains is None:
+        return False
+    return _is_consistent_with_zero(item) or not blocks_agree(gains)
+
+
+def blocks_agree(gains: FloatArray) -> bool:
+    """Whether wall blocks agree that an effect (sensor error) improves predictions, whatever the model leaves unexplained.
+
+    The test flips the signs of the blocks' gains at random. If the effect did not help, gains and losses would be equally
+    likely in each block. Then a sum as large as that of the observed gains would be rare: its probability must be at most
+    `verdict.block_p`. With so few blocks that this cannot be reached, all must gain.
+
+    gains: (b,) log-likelihood ratio with and without the effect in each of b blocks that no fit used.
+    """
+    signs = KeyedRandom(1, ("block gains",)).generator().choice([-1.0, 1.0], size=(DRAWS, len(gains)))
+    reached = int(np.sum(signs @ gains >= gains.sum() * (1 - _ROUNDING)))
+    return bool((gains > 0).all()) or (1 + reached) / (1 + DRAWS) <= thresholds().verdict.block_p
 
 
 def describe_weakness(item: NamedEffect) -> str:
     """Say in the report why an effect (sensor error) is mentioned but not named, although it improves the predictions.
 
-    item: an effect whose size is consistent with zero, or whose log-likelihood ratio on validation blocks is too small.
+    item: an effect whose size is consistent with zero, or on which the validation blocks do not agree.
     """
     if _is_consistent_with_zero(item):
         return "its value is within its uncertainty of zero"
-    return f"it gains only {item.gain:.1f} in log-likelihood on validation blocks"
+    return f"it gains {item.gain:.1f} in log-likelihood on validation blocks, but too few of the blocks gain"
 
 
 def _is_consistent_with_zero(item: NamedEffect) -> bool:
@@ -158,16 +193,28 @@ class _RegisteredResiduals:
         return float(-0.5 * (square + size))
 
 
-def _log_score_gain(
-    with_all: _RegisteredResiduals, without: _RegisteredResiduals, rows: BoolArray, at: FloatArray, sigma: float
-) -> float:
-    """Return the log score with an effect minus that without, over some rows (n,). Outliers of both models are left out.
+def _log_score_gains(
+    with_all: _RegisteredResiduals,
+    without: _RegisteredResiduals,
+    rows: BoolArray,
+    at: FloatArray,
+    block: NDArray[np.int64],
+    sigma: float,
+) -> FloatArray:
+    """(b,) log score with an effect minus that without, in each wall block. Outliers of both models are left out.
 
-    at: (n, 2) places on the wall, m; sigma: standard deviation of the reference error.
+    rows: (n,) points to score; at: (n, 2) places on the wall, m; block: (n,) wall block of each point; sigma: standard
+    deviation of the reference error.
     """
     chosen = np.flatnonzero(rows & (_inliers(with_all) | _inliers(without)))
     patch = wall_blocks_by_points(at[chosen], _POINTS_PER_PATCH)
-    return with_all.log_score(chosen, patch, sigma) - without.log_score(chosen, patch, sigma)
+    found = []
+    for number in np.unique(block[chosen]):
+        inside = block[chosen] == number
+        own_patch = np.unique(patch[inside], return_inverse=True)[1]
+        scores = (each.log_score(chosen[inside], own_patch, sigma) for each in (with_all, without))
+        found.append(next(scores) - next(scores))
+    return np.array(found)
 
 
 def _inliers(found: _RegisteredResiduals) -> BoolArray:

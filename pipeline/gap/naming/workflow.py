@@ -26,7 +26,7 @@ from pipeline.gap.naming.named_effects import (
     effect_from_tails,
     only_within_bounds,
 )
-from pipeline.gap.naming.selection_passes import PassInput, PassInputs, best_pass, subsample, subsample_rows
+from pipeline.gap.naming.selection_passes import PassInput, PassInputs, select_beside_edge_effects, subsample, subsample_rows
 from pipeline.gap.naming.separating_measurements import with_separating_measurements
 from pipeline.gap.naming.unseen_effects import unseen_effects
 from pipeline.gap.naming.validation import Validation, ValidationResult
@@ -235,7 +235,7 @@ def _diagnose(measurement: Measurement, clock: _Clock, random: KeyedRandom) -> G
         identifiability=selection.identifiability,
         seconds=clock.total,
         timings=clock.laps,
-        unseen=unseen_effects(plain, selection.detectable, [item.name.partition(".")[2] for item in result.named]),
+        unseen=unseen_effects(plain, selection.detectable(), [item.name.partition(".")[2] for item in result.named]),
         reference_sigma=selection.reference_sigma,
         thresholds=thresholds(),
     )
@@ -329,7 +329,7 @@ def _select_and_validate(
     inputs: PassInputs, random: KeyedRandom, excluded: frozenset[tuple[str, bool]] = frozenset()
 ) -> _ValidatedSelection:
     """Select effects and validate them. If an empirical term fails, the selection is repeated without empirical terms."""
-    best, aligned = best_pass(inputs, random, excluded), inputs.measurement
+    best, aligned = select_beside_edge_effects(inputs, random, excluded), inputs.measurement
     given, selection = best.pass_input, best.selection
     losses = _explain_losses(aligned, given)
     lost = [effect_from_losses(losses[0], aligned.cloud.intensity)] if losses else []
@@ -354,7 +354,8 @@ def _validate(aligned: Measurement, given: PassInput, named: list[NamedEffect], 
     tested = subsample_rows(np.flatnonzero(given.stable & given.held_out))
     rows = np.concatenate([given.training_rows, tested])
     training = np.arange(len(rows)) < len(given.training_rows)
-    return validate_effects(*subsample(aligned, given.residuals, rows), named, training, reference_sigma)
+    part = subsample(aligned, given.residuals, rows)
+    return validate_effects(*part, named, training, reference_sigma, given.cells.side_m)
 
 
 def _with_heavy_tails(
