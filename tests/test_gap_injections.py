@@ -115,6 +115,8 @@ def test_what_was_there_before_is_not_blamed_on_the_injection() -> None:
     both = answer("range_offset", OFFSET, said("range_offset", "offset_m", 0.01, 1e-4), wobble)
     assert scored(both, BeforeInjection({"wobble": wobble}))["judgement"] == "right"
     assert scored(both, BeforeInjection({"collimation": wobble}))["judgement"] == "wrong"
+    alike = said("collimation", "angle_rad", 1.0, 0.1, ["tls.wobble"])
+    assert scored(both, BeforeInjection({"collimation": alike}))["judgement"] == "right"
 
 
 def test_what_was_there_before_adds_to_the_injection() -> None:

@@ -41,8 +41,8 @@ _RULES = """These rules apply:
 - **Named** counts effects of the [catalogue](../reference/effects/README.md). An empirical term, which describes a pattern
   without a cause, is in the column "named" of the tables, but does not count. Some carry "empirical" in their name. Others
   have the name of a noise effect.
-- **New** is an effect that no diagnosis of the measurement without the injection names (there are two, see below). Effects
-  that one of them names may stand beside the injected one.
+- **New** is an effect that no diagnosis of the measurement without the injection names, or lists among those that cannot be
+  told from a named one (there are two diagnoses, see below). Such effects may stand beside the injected one.
 - **The size is right** within 3 standard errors or 15 % of the injected value, and the period of a wave within 5 %. Other
   parameters are not checked.
 - **What the measurement lacks before** adds to the injection, and that sum is right too. An effect that the diagnosis names

@@ -38,6 +38,12 @@ class BeforeInjection:
     effects: Mapping[str, Json] = field(default_factory=dict)
     missing_noise: float = 1.0
 
+    @property
+    def possible(self) -> set[str]:
+        """Names of these effects and of those that the diagnosis cannot tell from them."""
+        alike = (_bare(name) for each in self.effects.values() for name in each["cannot_be_told_from"])
+        return {*self.effects, *alike}
+
 
 _QUIET = BeforeInjection()
 
@@ -57,7 +63,7 @@ def scored(answer: Json, before: BeforeInjection = _QUIET) -> Json:
     physical = [each for each in said if each["kind"] == "physical"]
     own = next((each for each in physical if _bare(each["name"]) == effect), None)
     alike = any(effect in map(_bare, each["cannot_be_told_from"]) for each in physical)
-    new = [each for each in physical if _bare(each["name"]) not in before.effects]
+    new = [each for each in physical if _bare(each["name"]) not in before.possible]
     others = [each for each in new if each is not own and effect not in map(_bare, each["cannot_be_told_from"])]
     return {
         "number": case["number"],

@@ -58,10 +58,10 @@ def validate_effects(
 ) -> ValidatedEffects:
     """Test whether each named effect (sensor error) improves the likelihood of parts of the wall that no fit used.
 
-    The model with all effects is compared with the model without the tested one. Two systematic effects may only compensate each
-    other, and then each seems to be needed. Therefore all systematic effects are first tested together, and then each two of
-    them. If a group fails, the one with the smallest log-likelihood ratio is removed, an empirical term before any other, and
-    the test is repeated with the rest.
+    The model with all effects is compared with the model without the tested one. Systematic effects may only compensate each
+    other, and then each seems to be needed. Therefore groups of them are tested together first: all, all but the strongest ones,
+    and each two. If a group fails, its effect with the smallest log-likelihood ratio is removed, an empirical term before any
+    other, and the test is repeated with the rest.
 
     Parameters
     ----------
@@ -95,10 +95,8 @@ def validate_effects(
 
     found = {item.name: gains([item]) for item in scorable}
     total = {name: float(each.sum()) for name, each in found.items()}
-    systematic = [item for item in scorable if not item.adds_variance]
-    pairs = [*combinations(systematic, 2)]
-    groups = [systematic, *pairs] if len(pairs) > 1 else pairs
-    for group in groups:
+    strongest_first = sorted((item for item in scorable if not item.adds_variance), key=lambda item: -total[item.name])
+    for group in _groups(strongest_first):
         if gains(group).sum() <= 0:
             out = min(group, key=lambda item: (item.kind != "empirical", total[item.name]))
             rest = [each for each in named if each is not out]
@@ -108,6 +106,15 @@ def validate_effects(
     measured = [replace(item, gain=total[item.name]) if item.name in total else item for item in named if item not in failed]
     weak = [item for item in measured if _is_weak(item, found.get(item.name))] if len(measured) > 1 else []
     return ValidatedEffects([item for item in measured if item not in weak], failed, weak)
+
+
+def _groups(effects: Sequence[NamedEffect]) -> list[tuple[NamedEffect, ...]]:
+    """Groups of systematic effects that may compensate each other: all, all but the strongest ones, and each two of them.
+
+    effects: the strongest first.
+    """
+    nested = [tuple(effects[start:]) for start in range(len(effects) - 2)]
+    return [*nested, *combinations(effects, 2)]
 
 
 def _is_weak(item: NamedEffect, gains: FloatArray | None) -> bool:
