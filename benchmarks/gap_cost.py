@@ -33,7 +33,7 @@ MARKS = ("<!-- cost -->", "<!-- end of cost -->")
 PARTS: dict[str, list[tuple[Any, str]]] = {
     "first residuals and pose": [(workflow, "compute_residuals"), (workflow, "align")],
     "residuals beside effects": [(nonlinear_refit, "_aligned_with_estimates"), (selection_passes, "aligned_with")],
-    "edge effects": [(selection_passes, "_find_edge_effects"), (selection_passes, "_with_edge_effects")],
+    "edge effects": [(selection_passes, "_find_edge_effects"), (selection_passes, "_with_effects")],
     "scene changes": [(selection_passes, "find_scene_changes")],
     "signatures": [(effect_selection, "candidate_families"), (nonlinear_refit, "candidate_families")],
     "search: design and null": [(MeanSearch, "__init__")],

@@ -154,13 +154,13 @@ def test_two_effects_that_only_make_up_for_each_other_both_fail(tmp_path: Path, 
 
 
 def test_blocks_agree_on_an_effect_only_if_more_gain_than_chance_allows() -> None:
-    """Of gains that are as often negative, one in twenty sets passes (5 +- 1.5 %, false failure 0.3 %), however heavy the tails.
+    """Of gains that are as often negative, one in ten sets passes (10 +- 2 %, false failure 0.3 %), however heavy the tails.
 
     One block that gains much does not suffice. Gains of all blocks do, however different, also of as few as two.
     """
     rng = np.random.default_rng(1)
     passed = [blocks_agree(rng.standard_t(2, 20)) for _ in range(2000)]
-    assert 0.035 < np.mean(passed) < 0.065
+    assert 0.08 < np.mean(passed) < 0.12
     assert not blocks_agree(np.array([1000.0, *rng.standard_normal(20)]))
     assert blocks_agree(np.geomspace(1, 1e4, 20))
     assert blocks_agree(np.array([2.0, 3.0]))

@@ -22,7 +22,7 @@ from pipeline.gap.mean.mean_model import MeanModel, fit_reml
 from pipeline.gap.mean.search import MeanSearch
 from pipeline.gap.naming import nonlinear_refit
 from pipeline.gap.naming.candidate_families import candidate_families
-from pipeline.gap.naming.effect_screening import rank_by_noise_left
+from pipeline.gap.naming.effect_screening import screen_effects
 from pipeline.gap.naming.named_effects import NamedEffect, effect_from_estimate
 from pipeline.gap.naming.nonlinear_refit import (
     SearchInput,
@@ -33,6 +33,7 @@ from pipeline.gap.naming.nonlinear_refit import (
     search_at_joint_fit,
 )
 from pipeline.gap.naming.search_residuals import with_fitted_variance
+from pipeline.gap.naming.selection_passes import PassInput, PassInputs
 from pipeline.gap.naming.validation_scores import validate_effects
 from pipeline.gap.naming.workflow import diagnose
 from pipeline.gap.noise_and_edges.variance_model import VarianceTerm, fit_variance_model
@@ -213,7 +214,10 @@ def test_slopes_do_not_serve_where_what_they_miss_is_as_much_as_something_gains(
 
 
 def test_the_effect_that_leaves_the_least_noise_ranks_first(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A principal point is off by 8 px; with it in the model, the residuals are as small as the noise again."""
+    """A principal point is off by 8 px; with it in the model, the residuals are as small as the noise again.
+
+    Fewer points count as outliers beside it, so that it is a large effect if as few as 1 % make the search look for one.
+    """
     drawn = [("principal_point_x", {"camera": "left", "delta_px": 8.0}, Strength(0.0, "", 0.0))]
     monkeypatch.setattr(stereo_cases, "_drawn", lambda *_: drawn)
     case = Case(0, (1, 5), "one", "stereo", ("principal_point_x",), 2_000, 2_000)
@@ -223,11 +227,34 @@ def test_the_effect_that_leaves_the_least_noise_ranks_first(tmp_path: Path, monk
     search = MeanSearch(part, candidate_families(there, part), KeyedRandom(1))
     tried = [each for each in search.effect_variants() if each.name in {"principal_point_x", "focal_length", "radial_distortion"}]
     assert len(tried) == 9  # each in the left camera, in the right one and in both
-    ranked = rank_by_noise_left(there, part, tried[::-1])
-    assert [(each.name, each.fixed["camera"]) for each in ranked[:2]] == [
+    ranked = screen_effects(there, part, tried[::-1], 9)
+    assert {(each.candidate.name, each.candidate.fixed["camera"]) for each in ranked[:2]} == {
         ("principal_point_x", "left"),
         ("principal_point_x", "right"),
-    ]
+    }
+    inputs = PassInputs(there, residuals, np.zeros(len(there.cloud.points), dtype=bool))
+    without = PassInput.of(there, residuals, inputs.held_out_points, []).excluded_share
+    with use_thresholds(_with_moved_share(0.01)):
+        assert inputs.large_effect is not None
+        assert inputs.with_these([]).excluded_share < without / 2
+    assert inputs.large_effect.name == "stereo.principal_point_x"
+    size = inputs.large_effect.entry
+    assert size["delta_px"] == pytest.approx({"left": 8.0, "right": -8.0}[size["camera"]], abs=0.2)
+
+
+def test_rock_that_moved_is_no_large_effect(tmp_path: Path) -> None:
+    """Every eighth point lies 1 m further away, which no effect of the sensor explains."""
+    write_scan(tmp_path, 8, step_rad=0.007, ranges=lambda scan: scan.R + 1.0 * (np.arange(len(scan.R)) % 8 == 0))
+    there, residuals, _ = align(read_measurement(tmp_path))
+    inputs = PassInputs(there, residuals, np.zeros(len(there.cloud.points), dtype=bool))
+    assert PassInput.of(there, residuals, inputs.held_out_points, []).excluded_share > 0.1
+    with use_thresholds(_with_moved_share(0.1)):
+        assert inputs.large_effect is None
+
+
+def _with_moved_share(share: float) -> Thresholds:
+    changes = Thresholds().changes.model_copy(update={"moved_share": share})
+    return Thresholds().model_copy(update={"changes": changes})
 
 
 def test_two_large_effects_are_found_where_all_together_fit_best(

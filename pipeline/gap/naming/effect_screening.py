@@ -3,20 +3,24 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
+from pipeline.change.robust import nmad
 from pipeline.formats.measurements.measurement import Measurement
 from pipeline.gap.mean.candidates import Candidate, prior_precision
 from pipeline.gap.mean.selection import SelectedEffect
 from pipeline.gap.naming.named_effects import Estimate, aligned_with, effect_from_estimate, out_of_bounds
 from pipeline.gap.residuals.alignment import fit_pose_robustly
 from pipeline.gap.residuals.residuals import Residuals
+from pipeline.gap.thresholds import thresholds
 from scene.geometry.mesh import FloatArray
 
 _FEWEST_POINTS = 3_000
 """Points of the subsample: at least this many, if there are so many, and less than twice as many. They suffice for a ranking."""
+_REFINING_STEPS = 5
+"""Gauss-Newton steps by which the size of a large effect is refined."""
 
 
 def gauss_newton_step(at: Residuals, columns: FloatArray, precision: FloatArray, values: FloatArray) -> FloatArray:
@@ -53,18 +57,20 @@ def estimate_of_size(candidate: Candidate, values: FloatArray) -> Estimate:
     return Estimate(nothing, candidate, values, np.zeros((len(values), len(values))))
 
 
-def rank_by_noise_left(measurement: Measurement, part: Residuals, candidates: Sequence[Candidate]) -> list[Candidate]:
-    """Rank sensor errors (effects) by how small the residuals become when each is put into the sensor model alone.
+def screen_effects(measurement: Measurement, part: Residuals, candidates: Sequence[Candidate], count: int) -> list[Estimate]:
+    """Find the sensor errors (effects) with which the residuals become smallest, when each is put into the sensor model alone.
 
     A linearised model ranks effects wrongly if the error is so large that rays meet other parts of a rough wall. Here each
-    effect gets its size by one Gauss-Newton step, the pose is estimated again with it, and residuals are computed anew. At most
-    about 6,000 points are used, to save time.
+    effect gets its size by one Gauss-Newton step, the pose is estimated again with it, and residuals are computed anew. The
+    sizes of the best ones are then refined by further steps, from the points that are no outliers beside them. At most about
+    6,000 points are used, to save time.
 
     Parameters
     ----------
     measurement : the measured points with the sensor model that is tested.
     part : residuals of n of its points, measured minus predicted.
     candidates : effects as regression terms at these n points.
+    count : number of effects to return.
 
     Returns
     -------
@@ -72,24 +78,55 @@ def rank_by_noise_left(measurement: Measurement, part: Residuals, candidates: Se
     """
     rows = np.arange(0, len(part), max(len(part) // _FEWEST_POINTS, 1))
     few = part.part(rows)
-    points = measurement.part(few.index)
-    few = replace(few, index=np.arange(len(rows)))
-    noise = {candidate: _noise_left(points, few, candidate.part(rows)) for candidate in candidates}
-    return sorted((each for each in noise if np.isfinite(noise[each])), key=lambda each: noise[each])
+    points, few = measurement.part(few.index), replace(few, index=np.arange(len(rows)))
+    screened = [(each, _ScreenedEffect.of_one_step(points, few, each.part(rows))) for each in candidates]
+    possible = [(each, fit) for each, fit in screened if fit is not None and np.isfinite(fit.noise_left)]
+    found = []
+    for candidate, fit in sorted(possible, key=lambda item: item[1].noise_left)[:count]:
+        best = fit
+        for _ in range(_REFINING_STEPS):
+            best = best.improved(points, few) or best
+        found.append((best.noise_left, estimate_of_size(candidate, best.estimate.values)))
+    return [estimate for _, estimate in sorted(found, key=lambda item: item[0])]
 
 
-def _noise_left(measurement: Measurement, part: Residuals, candidate: Candidate) -> float:
-    """Median absolute residual over its predicted standard deviation with one effect in the model; infinite if it is implausible.
+@dataclass(frozen=True)
+class _ScreenedEffect:
+    """One effect alone in the model. estimate: the effect with its size; residuals: with it in the model; value: registered.
 
-    Points that no longer meet the wall count as infinitely far off.
+    noise_left: median absolute residual over its predicted standard deviation; points that no longer meet the wall count as
+    infinitely far off.
     """
-    width = candidate.columns.shape[1]
-    size = gauss_newton_step(part, candidate.columns, prior_precision(candidate, width), np.zeros(width))
-    estimate = estimate_of_size(candidate, size)
-    if out_of_bounds(measurement, [estimate], part):
-        return np.inf
-    found = aligned_with(measurement, [effect_from_estimate(estimate, part)], part.index).residuals
-    value, _, _ = fit_pose_robustly(found)
-    off = np.full(len(part), np.inf)
-    off[np.isin(part.index, found.index)] = np.abs(value / found.sigma)[np.isin(found.index, part.index)]
-    return float(np.median(off))
+
+    estimate: Estimate
+    residuals: Residuals
+    value: FloatArray
+    noise_left: float
+
+    @classmethod
+    def of(cls, measurement: Measurement, part: Residuals, estimate: Estimate) -> _ScreenedEffect | None:
+        """Put an effect into the model of n points; None if its size is implausible."""
+        if out_of_bounds(measurement, [estimate], part):
+            return None
+        found = aligned_with(measurement, [effect_from_estimate(estimate, part)], part.index).residuals
+        value, _, _ = fit_pose_robustly(found)
+        off = np.full(len(part), np.inf)
+        off[np.isin(part.index, found.index)] = np.abs(value / found.sigma)[np.isin(found.index, part.index)]
+        return cls(estimate, found, value, float(np.median(off)))
+
+    @classmethod
+    def of_one_step(cls, measurement: Measurement, part: Residuals, candidate: Candidate) -> _ScreenedEffect | None:
+        """Put an effect into the model of n points, at the size of one Gauss-Newton step; None if that is implausible."""
+        width = candidate.columns.shape[1]
+        size = gauss_newton_step(part, candidate.columns, prior_precision(candidate, width), np.zeros(width))
+        return cls.of(measurement, part, estimate_of_size(candidate, size))
+
+    def improved(self, measurement: Measurement, part: Residuals) -> _ScreenedEffect | None:
+        """Return the fit after one Gauss-Newton step on the points that are no outliers now; None if it is no better."""
+        z = np.abs(self.value / self.residuals.sigma)
+        good = self.residuals.usable & (z < thresholds().points.outlier_sigmas * max(nmad(z * np.sign(self.value), 0.0), 1.0))
+        at, candidate = self.residuals.part(good), self.estimate.candidate
+        columns = candidate.columns[at.index]
+        step = gauss_newton_step(at, columns, prior_precision(candidate, columns.shape[1]), self.estimate.values)
+        found = _ScreenedEffect.of(measurement, part, estimate_of_size(candidate, self.estimate.values + step))
+        return found if found is not None and found.noise_left < self.noise_left else None

@@ -125,6 +125,7 @@ def select_effects(
     random: KeyedRandom,
     excluded: frozenset[tuple[str, bool]] = frozenset(),
     grid_noise: VarianceTerm | None = None,
+    noise: FloatArray | None = None,
 ) -> tuple[list[NamedEffect], SelectionResult]:
     """Find the systematic sensor errors and noise terms that explain the residuals of a measurement (forward selection).
 
@@ -143,6 +144,8 @@ def select_effects(
         all empirical terms.
     grid_noise : noise that neighbouring points share, if a preceding selection found it in its residuals. It is then part of
         the model from the start, because it imitates empirical terms and errors of the reference. None in a first selection.
+    noise : (n,) what is left of the residuals beside an error that is so large that most of the residuals would look like noise;
+        noise terms are fitted to it. None: the registered residuals.
 
     Returns
     -------
@@ -150,16 +153,17 @@ def select_effects(
     """
     named: list[NamedEffect] = []
     all_residuals, initial_noise_ratio, added = part, noise_ratio, 0.0
+    left_beside = fit_pose_robustly(part)[0] if noise is None else noise
     range_step = locking = None
     if isinstance(part, TlsResiduals) and not model_has(measurement, RangeQuantization.tag()):
         range_step = find_range_step(part.geometry.measured_m)
     if isinstance(part, StereoResiduals) and not model_has(measurement, PixelLocking.tag()):
         at = part.geometry
-        allowed = NoiseBounds(float(np.median(part.sigma)), nmad(fit_pose_robustly(part)[0]))
+        allowed = NoiseBounds(float(np.median(part.sigma)), nmad(left_beside))
         locking = find_locking(at.found, at.disparity, at.tangent, at.infinity, allowed)
     tiles_known = (TileShift.tag(), False) in excluded or model_has(measurement, TileShift.tag())
     if isinstance(part, StereoResiduals) and not tiles_known:
-        seams = find_tile_seams(part, fit_pose_robustly(part)[0])
+        seams = find_tile_seams(part, left_beside)
         if seams is not None:
             return _select_beside_tiles(measurement, part, effect_from_seams(seams), random, excluded)
     if range_step is not None:
@@ -174,11 +178,13 @@ def select_effects(
     out = excluded | found_separately
     possible = (each for each in candidate_families(measurement, part) if (each.name, each.empirical) not in out)
     families = [each for each in possible if not (each.empirical and NONPARAMETRIC_TERMS in out)]
+    if noise is None:
+        left_beside = fit_pose_robustly(part)[0]
     noise_terms, variance_tried, note = _fit_variance(
-        measurement, part, WallCells.over(part.wall_xy), fit_pose_robustly(part)[0], random, excluded
+        measurement, part, WallCells.over(part.wall_xy), left_beside, random, excluded
     )
     if wrong := _implausible_variance(measurement, noise_terms):
-        return select_effects(measurement, all_residuals, initial_noise_ratio, random, excluded | wrong)
+        return select_effects(measurement, all_residuals, initial_noise_ratio, random, excluded | wrong, noise=noise)
     if not noise_terms and grid_noise is not None:
         noise_terms = [grid_noise]
 
@@ -207,13 +213,13 @@ def select_effects(
                 noise_left, shared = find_grid_noise(found.residuals, left, model, random)
                 described = any(each.candidate.empirical for each in found.estimates)
                 if noise_left is not None and grid_noise is None:
-                    noise_in_all = find_grid_noise(part, fit_pose_robustly(part)[0], model, random)[0] if described else None
+                    noise_in_all = find_grid_noise(part, left_beside, model, random)[0] if described else None
                     refound = noise_in_all or noise_left.with_constant_variance(len(part))
-                    return select_effects(measurement, all_residuals, initial_noise_ratio, random, excluded, refound)
+                    return select_effects(measurement, all_residuals, initial_noise_ratio, random, excluded, refound, noise)
                 kept = noise_left or (None if described else grid_noise)
                 noise_terms, note = ([], note or shared) if kept is None else ([kept], note)
     if wrong := (wrong | _implausible_variance(measurement, noise_terms)) - excluded:
-        again, result = select_effects(measurement, all_residuals, initial_noise_ratio, random, excluded | wrong)
+        again, result = select_effects(measurement, all_residuals, initial_noise_ratio, random, excluded | wrong, noise=noise)
         return keep_implausible_in_class(
             again, found.chosen, frozenset(each.candidate.name for each in found.estimates), wrong
         ), result

@@ -13,7 +13,7 @@ from pipeline.gap.mean.nonparametric_terms import HARMONIC_ORDERS, HARMONICS, ha
 from pipeline.gap.mean.search import MeanSearch
 from pipeline.gap.mean.selection import FamilyScore, SelectedEffect
 from pipeline.gap.naming.candidate_families import PERIODIC, candidate_families, catalogue_families
-from pipeline.gap.naming.effect_screening import estimate_of_size, gauss_newton_step, rank_by_noise_left
+from pipeline.gap.naming.effect_screening import estimate_of_size, gauss_newton_step, screen_effects
 from pipeline.gap.naming.named_effects import Estimate, aligned_with, effect_from_estimate, out_of_bounds
 from pipeline.gap.naming.search_residuals import with_added_variance, with_fitted_variance
 from pipeline.gap.noise_and_edges.variance_model import VarianceTerm
@@ -178,13 +178,13 @@ def select_and_refit(given: SearchInput, first: MeanSearch) -> SearchOutcome:
     """
     together, tried = first.select()
     linear = SearchOutcome(together, _estimates_of(first, together), first, given.part, together, tried)
-    alone = _strongest_single_fits(given, first, together) if together else []
-    if not alone:
+    alone = _strongest_single_fits(given, first, together) if together else None
+    if alone is None:
         return _search_beside(given, linear) or linear
-    beside_best = _search_beside_best(given, linear, alone)
+    beside_best = _search_beside_best(given, linear, alone) if alone else None
     if beside_best is None or len(beside_best.estimates) > 1:
         screened = _screened_single_fits(given, first, alone)
-        if screened[0] is not alone[0]:
+        if screened[:1] != alone[:1]:
             beside_best = _search_beside_best(given, linear, screened) or beside_best
     if beside_best is not None and len(beside_best.estimates) == 1:
         return beside_best
@@ -278,10 +278,10 @@ def _all_columns(candidates: list[Candidate]) -> FloatArray:
     return columns
 
 
-def _strongest_single_fits(given: SearchInput, first: MeanSearch, together: list[SelectedEffect]) -> list[_SingleFit]:
+def _strongest_single_fits(given: SearchInput, first: MeanSearch, together: list[SelectedEffect]) -> list[_SingleFit] | None:
     """The effects that alone explain most, refitted without linearising, best first.
 
-    Empty where the linearised model is good enough: its error is smaller than the gain of any selected effect.
+    None where the linearised model is good enough: its error is smaller than the gain of any selected effect.
     """
     found: list[_SingleFit] = []
     tolerance = min([thresholds().mean.class_margin, *(_ABSORBED_SHARE * each.log_likelihood_ratio for each in together)])
@@ -292,7 +292,7 @@ def _strongest_single_fits(given: SearchInput, first: MeanSearch, together: list
         compared = alone.used | (len(together) > 1)  # several effects may rest on points that the refit of one leaves out
         linearised = first.design.log_likelihood(np.where(compared, given.part.value, 0.0), candidate)
         if not found and abs(alone.log_likelihood - linearised) < tolerance:
-            return []
+            return None
         found.append(alone)
     if not found:
         return []
@@ -305,8 +305,8 @@ def _screened_single_fits(given: SearchInput, first: MeanSearch, alone: list[_Si
 
     Of each effect the best fit is kept; best first.
     """
-    ranked = rank_by_noise_left(given.measurement, given.part, first.effect_variants())[:_MOST_CONVERGED]
-    more = [each for each in (_single_fit(given, first, candidate) for candidate in ranked) if each is not None]
+    sized = screen_effects(given.measurement, given.part, first.effect_variants(), _MOST_CONVERGED)
+    more = [each for each in (_single_fit(given, first, item.candidate, item.values) for item in sized) if each is not None]
     if not more:
         return alone
     best: dict[str, _SingleFit] = {}
@@ -332,10 +332,12 @@ def _with_alternatives(given: SearchInput, first: MeanSearch, alone: list[_Singl
     return _with_alternatives(given, first, ranked, set(ranked[0].estimate.chosen.indistinguishable))
 
 
-def _single_fit(given: SearchInput, first: MeanSearch, candidate: Candidate) -> _SingleFit | None:
-    """One effect in the model, at the coefficients of the linearised fit."""
+def _single_fit(
+    given: SearchInput, first: MeanSearch, candidate: Candidate, values: FloatArray | None = None
+) -> _SingleFit | None:
+    """One effect in the model, at some coefficients; None: at those of the linearised fit."""
     (estimate,) = _estimates_of(first, [first.selected_alone(candidate)])
-    return _SingleFit.of(given, first, estimate)
+    return _SingleFit.of(given, first, estimate if values is None else replace(estimate, values=values))
 
 
 def _best_variants(given: SearchInput, first: MeanSearch, found: list[_SingleFit]) -> list[_SingleFit]:

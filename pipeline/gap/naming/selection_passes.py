@@ -3,14 +3,24 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.formats.measurements.measurement import Measurement, StereoMeasurement, TlsMeasurement
-from pipeline.gap.naming.candidate_families import model_has
+from pipeline.gap.mean.candidates import Candidate
+from pipeline.gap.naming.candidate_families import catalogue_families, model_has
+from pipeline.gap.naming.effect_screening import screen_effects
 from pipeline.gap.naming.effect_selection import SelectionResult, select_effects
-from pipeline.gap.naming.named_effects import NamedEffect, aligned_with, effect_from_edges, with_effects
+from pipeline.gap.naming.named_effects import (
+    NamedEffect,
+    aligned_with,
+    effect_from_edges,
+    effect_from_estimate,
+    with_effects,
+)
 from pipeline.gap.noise_and_edges.beam_footprint import find_footprint
 from pipeline.gap.noise_and_edges.disparity_edges import find_disparity_edge_effects
 from pipeline.gap.noise_and_edges.edge_effects import EdgeEffect
@@ -50,6 +60,9 @@ class PassInput:
     cells : small squares of the wall; the search for systematic errors averages the residuals in each.
     held_out : (n,) true for points that are kept for validation.
     training_rows : (k,) rows of the residuals that the search may use.
+    excluded_share : share of the points on smooth rock that the search may not use, because they count as changed or as outliers.
+    large_effect : an error so large that without it much of the rock would count as changed. It was in the model while changes,
+        outliers and `registered_residuals` were computed, and is not in `residuals`. None if there is none.
     """
 
     edge_effects: list[EdgeEffect]
@@ -63,9 +76,18 @@ class PassInput:
     cells: WallCells
     held_out: BoolArray
     training_rows: NDArray[np.int64]
+    excluded_share: float
+    large_effect: NamedEffect | None = None
 
     @classmethod
-    def of(cls, aligned: Measurement, plain: Residuals, held_out_points: BoolArray, edge_effects: list[EdgeEffect]) -> PassInput:
+    def of(
+        cls,
+        aligned: Measurement,
+        plain: Residuals,
+        held_out_points: BoolArray,
+        edge_effects: list[EdgeEffect],
+        large_effect: NamedEffect | None = None,
+    ) -> PassInput:
         """Build the input of one run of the search for sensor errors, with certain edge effects in the sensor model.
 
         Edge effects are errors at depth steps: edge fattening, smoothing, filled occlusions and the beam footprint. Regions
@@ -77,24 +99,30 @@ class PassInput:
         plain : its residuals without edge effects.
         held_out_points : (N,) true for points that are kept for validation.
         edge_effects : edge effects to put into the model. Their attribute `touched` must have a value for each of the N points.
+        large_effect : an error so large that without it most of the rock would count as changed. It is in the model while
+            changes and outliers are found, and not in the residuals.
         """
         touched = np.any([np.zeros(len(plain), dtype=bool), *(each.touched[plain.index] for each in edge_effects)], axis=0)
         registration_rows = plain.index[~(touched | held_out_points[plain.index])]
-        modelled, residuals = _with_edge_effects(aligned, plain, edge_effects, touched, registration_rows)
-        registered_residuals, _, noise_ratio = fit_pose_robustly(residuals)
-        sight = SensorView.of(aligned, residuals)
+        entries = [effect_from_edges(each).entry for each in edge_effects]
+        modelled, residuals, _ = _with_effects(aligned, plain, entries, touched, registration_rows)
+        large = [] if large_effect is None else [large_effect.entry]
+        _, judged, smooth = _with_effects(modelled, residuals, large, touched, registration_rows)
+        judged = replace(judged, usable=judged.usable & smooth)
+        registered_residuals, _, noise_ratio = fit_pose_robustly(judged)
+        sight = SensorView.of(aligned, judged)
         changes, changed = find_scene_changes(
-            replace(residuals, value=registered_residuals), sight, residuals.on_smooth_surface & ~touched
+            replace(judged, value=registered_residuals), sight, judged.on_smooth_surface & smooth & ~touched
         )
         if isinstance(aligned, TlsMeasurement) and aligned.scans:
             changes = drop_duplicates(changes)
-        registered_residuals, _, noise_ratio = fit_pose_robustly(replace(residuals, usable=residuals.usable & ~changed))
+        registered_residuals, _, noise_ratio = fit_pose_robustly(replace(judged, usable=judged.usable & ~changed))
         cells = WallCells.over(residuals.wall_xy)
         held_out = held_out_points[residuals.index]
         usable = (
-            residuals.usable
+            judged.usable
             & ~changed
-            & (np.abs(registered_residuals) < thresholds().points.outlier_sigmas * noise_ratio * residuals.sigma)
+            & (np.abs(registered_residuals) < thresholds().points.outlier_sigmas * noise_ratio * judged.sigma)
         )
         training_rows = subsample_rows(np.flatnonzero(usable & ~held_out))
         return cls(
@@ -109,6 +137,8 @@ class PassInput:
             cells,
             held_out,
             training_rows,
+            1 - float(usable.sum()) / max(int(judged.usable.sum()), 1),
+            large_effect,
         )
 
     @property
@@ -165,7 +195,10 @@ class SelectionPass:
         random : source of random numbers for the null distributions.
         excluded : effects that are not tried, as pairs (name, whether it is an empirical term).
         """
-        return cls(pass_input, *select_effects(*pass_input.training_part, pass_input.noise_ratio, random, excluded))
+        given = pass_input
+        noise = None if given.large_effect is None else given.registered_residuals[given.training_rows]
+        found = select_effects(*given.training_part, given.noise_ratio, random, excluded, noise=noise)
+        return cls(given, *found)
 
     @property
     def edge_effect_names(self) -> set[str]:
@@ -195,9 +228,37 @@ class PassInputs:
     plain: Residuals
     held_out_points: BoolArray
 
+    @cached_property
+    def _without_effects(self) -> PassInput:
+        """Input of a search without edge effects, and without a large one."""
+        return PassInput.of(self.measurement, self.plain, self.held_out_points, [])
+
+    @cached_property
+    def large_effect(self) -> NamedEffect | None:
+        """An effect of the catalogue so large that without it much of the rock would count as changed; None if there is none.
+
+        It is searched if a search would exclude as large a share of the points as the threshold `changes.moved_share`. The effect
+        that alone makes the residuals smallest is the reason if the share is less than half as large beside it.
+        """
+        excluded = self._without_effects.excluded_share
+        if excluded < thresholds().changes.moved_share:
+            return None
+        part = subsample(self.measurement, self.plain, np.flatnonzero(self.plain.usable & ~self._held_out))
+        candidates = [each for each in catalogue_families(*part) if isinstance(each, Candidate)]
+        found = [effect_from_estimate(each, part[1]) for each in screen_effects(*part, candidates, 1)]
+        beside = [PassInput.of(self.measurement, self.plain, self.held_out_points, [], each) for each in found]
+        return next((each for each, given in zip(found, beside, strict=True) if 2 * given.excluded_share < excluded), None)
+
+    @property
+    def _held_out(self) -> BoolArray:
+        """(n,) points with a residual that are kept for validation."""
+        return self.held_out_points[self.plain.index]
+
     def edge_effects(self) -> list[EdgeEffect]:
-        """Find the effects at depth steps (edge effects) that the residuals show without any other error in the model."""
-        return _find_edge_effects(self.measurement, self.plain, self.held_out_points)
+        """Find the effects at depth steps (edge effects) that the residuals show beside a large effect, if there is one."""
+        if self.large_effect is None:
+            return _find_edge_effects(self.measurement, self.plain, self.held_out_points)
+        return self._edge_effects_beside([self.large_effect], [])
 
     def edge_effects_given(self, found: SelectionPass) -> list[EdgeEffect]:
         """Search effects at depth steps (edge effects) again, with other errors in the model that can hide or imitate them.
@@ -210,9 +271,12 @@ class PassInputs:
         -------
         list : the edge effects that the residuals then show.
         """
-        known = [*found.named, *map(effect_from_edges, found.pass_input.edge_effects)]
-        posed = aligned_with(self.measurement, known, self.plain.index[~self.held_out_points[self.plain.index]]).measurement
-        seen = posed.changed(model=with_effects(self.measurement.model, [item.entry for item in found.named]))
+        return self._edge_effects_beside(found.named, [effect_from_edges(each) for each in found.pass_input.edge_effects])
+
+    def _edge_effects_beside(self, named: list[NamedEffect], known: list[NamedEffect]) -> list[EdgeEffect]:
+        """Find edge effects beside other effects. known: edge effects that are in the model while the pose is estimated."""
+        posed = aligned_with(self.measurement, [*named, *known], self.plain.index[~self._held_out]).measurement
+        seen = posed.changed(model=with_effects(self.measurement.model, [item.entry for item in named]))
         return _find_edge_effects(seen, compute_residuals(seen), self.held_out_points)
 
     def with_these(self, edge_effects: list[EdgeEffect]) -> PassInput:
@@ -220,7 +284,9 @@ class PassInputs:
 
         The sensor's pose is estimated again with these in the model. edge_effects: the effects, such as edge fattening.
         """
-        return PassInput.of(self.measurement, self.plain, self.held_out_points, edge_effects)
+        if not edge_effects and self.large_effect is None:
+            return self._without_effects
+        return PassInput.of(self.measurement, self.plain, self.held_out_points, edge_effects, self.large_effect)
 
 
 def select_beside_edge_effects(inputs: PassInputs, random: KeyedRandom, excluded: frozenset[tuple[str, bool]]) -> SelectionPass:
@@ -279,21 +345,24 @@ def _can_show_footprints(measurement: TlsMeasurement) -> bool:
     return not noisy and not model_has(measurement, BeamDivergence.tag())
 
 
-def _with_edge_effects(
+def _with_effects(
     measurement: Measurement,
     residuals: Residuals,
-    edge_effects: list[EdgeEffect],
+    entries: list[dict[str, Any]],
     touched: BoolArray,
     registration_rows: NDArray[np.int64],
-) -> tuple[Measurement, Residuals]:
-    """Put edge effects into the model and return the measurement with the residuals of the same points.
+) -> tuple[Measurement, Residuals, BoolArray]:
+    """Put effects into the model, as entries of a config.
 
     The pose is estimated again from `registration_rows`, rows of the measurement's points. touched: (n,) points
-    that the effects move, which then do not count as smooth.
+    that the effects move, which then may not be used.
+
+    Returns
+    -------
+    The measurement, the residuals of the same n points, and (n,) true for those that see smooth surface with the effects.
     """
-    if not edge_effects:
-        return measurement, residuals
-    entries = [effect_from_edges(shape).entry for shape in edge_effects]
+    if not entries:
+        return measurement, residuals, residuals.on_smooth_surface
     modelled = measurement.changed(model=with_effects(measurement.model, entries))
     modelled, found, _ = align(modelled, registration_rows)
     place = np.full(len(measurement.cloud.points), -1)
@@ -301,7 +370,9 @@ def _with_edge_effects(
     rows = place[residuals.index]
     known = rows >= 0
     matched = residuals.with_rows_from(known, found.part(rows[known]))
-    return modelled, replace(matched, usable=residuals.usable & ~touched & known)
+    smooth = np.zeros(len(residuals), dtype=bool)
+    smooth[known] = found.on_smooth_surface[rows[known]]
+    return modelled, replace(matched, usable=residuals.usable & ~touched & known), smooth
 
 
 def subsample(measurement: Measurement, residuals: Residuals, rows: NDArray[np.int64]) -> tuple[Measurement, Residuals]:

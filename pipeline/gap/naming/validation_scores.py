@@ -40,7 +40,7 @@ class ValidatedEffects:
     ----------
     named : effects that improve the predictions; the gain of each is its log-likelihood ratio on these parts.
     failed : effects that do not improve them.
-    weak : effects that improve them on the whole, but not in enough of the parts to be reported by name.
+    weak : effects that improve them, but by too little or in too few of the parts to be reported by name.
     """
 
     named: list[NamedEffect]
@@ -76,8 +76,8 @@ def validate_effects(
     Returns
     -------
     ValidatedEffects : accepted effects; failed ones, which do not improve the likelihood; and weak ones, which improve it, but
-        too little to be named beside others: the wall blocks do not agree on it (`verdict.block_p`), or the effect's size is
-        within its uncertainty of zero.
+        too little to be named beside others: by no more than `variance.least_gain`, in too few wall blocks (`verdict.block_p`),
+        or the effect's size is within its uncertainty of zero.
     """
     scorable = [item for item in named if item.effect.scored()]
     if not scorable or (~training).sum() < 100:
@@ -118,10 +118,10 @@ def _groups(effects: Sequence[NamedEffect]) -> list[tuple[NamedEffect, ...]]:
 
 
 def _is_weak(item: NamedEffect, gains: FloatArray | None) -> bool:
-    """Whether the wall blocks do not agree that an effect beside others improves the predictions, or its size may be zero."""
+    """Whether an effect beside others gains too little, or in too few wall blocks, to be named, or may be of size zero."""
     if item.kind != "physical" or gains is None:
         return False
-    return _is_consistent_with_zero(item) or not blocks_agree(gains)
+    return item.gain <= thresholds().variance.least_gain or _is_consistent_with_zero(item) or not blocks_agree(gains)
 
 
 def blocks_agree(gains: FloatArray) -> bool:
@@ -141,10 +141,13 @@ def blocks_agree(gains: FloatArray) -> bool:
 def describe_weakness(item: NamedEffect) -> str:
     """Say in the report why an effect (sensor error) is mentioned but not named, although it improves the predictions.
 
-    item: an effect whose size is consistent with zero, or on which the validation blocks do not agree.
+    item: an effect whose size is consistent with zero, whose log-likelihood ratio on validation blocks is too small, or on which
+        these blocks do not agree.
     """
     if _is_consistent_with_zero(item):
         return "its value is within its uncertainty of zero"
+    if item.gain <= thresholds().variance.least_gain:
+        return f"it gains only {item.gain:.1f} in log-likelihood on validation blocks"
     return f"it gains {item.gain:.1f} in log-likelihood on validation blocks, but too few of the blocks gain"
 
 
