@@ -184,7 +184,7 @@ def select_and_refit(given: SearchInput, first: MeanSearch) -> SearchOutcome:
     beside_best = _search_beside_best(given, linear, alone) if alone else None
     if beside_best is None or len(beside_best.estimates) > 1:
         screened = _screened_single_fits(given, first, alone)
-        if screened[:1] != alone[:1]:
+        if screened and (not alone or screened[0] is not alone[0]):
             beside_best = _search_beside_best(given, linear, screened) or beside_best
     if beside_best is not None and len(beside_best.estimates) == 1:
         return beside_best
@@ -301,10 +301,7 @@ def _strongest_single_fits(given: SearchInput, first: MeanSearch, together: list
 
 
 def _screened_single_fits(given: SearchInput, first: MeanSearch, alone: list[_SingleFit]) -> list[_SingleFit]:
-    """Add single fits of the effects that leave the least noise if each is in the model without linearising.
-
-    Of each effect the best fit is kept; best first.
-    """
+    """Add single fits of the effects that leave the least noise alone; of each effect the best one is kept, best first."""
     sized = screen_effects(given.measurement, given.part, first.effect_variants(), _MOST_CONVERGED)
     more = [each for each in (_single_fit(given, first, item.candidate, item.values) for item in sized) if each is not None]
     if not more:
