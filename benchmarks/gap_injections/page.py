@@ -105,9 +105,6 @@ _CAUSES = {
         "its noise is 0.009 px with 3 % outliers, and it disagrees with its model by some thousandths of a pixel before; "
         "camera effects of that size are named"
     ),
-    "`light`, 3 px of the principal point, 5 px of the focal length": (
-        "the image moves by 2 to 3 px across edges that are known to 0.01 px, so the edges count as change or noise"
-    ),
     "`light`, smoothing": (
         "it is found with its width, but dropped: a few points beside edges lie farther off with it, and outweigh the others on "
         "the validation blocks"
