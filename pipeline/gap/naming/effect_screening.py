@@ -123,8 +123,8 @@ class _ScreenedEffect:
 
     def improved(self, measurement: Measurement, part: Residuals) -> _ScreenedEffect | None:
         """Return the fit after one Gauss-Newton step on the points that are no outliers now; None if it is no better."""
-        z = np.abs(self.value / self.residuals.sigma)
-        good = self.residuals.usable & (z < thresholds().points.outlier_sigmas * max(nmad(z * np.sign(self.value), 0.0), 1.0))
+        z = self.value / self.residuals.sigma
+        good = self.residuals.usable & (np.abs(z) < thresholds().points.outlier_sigmas * max(nmad(z, 0.0), 1.0))
         at, candidate = self.residuals.part(good), self.estimate.candidate
         columns = candidate.columns[at.index]
         step = gauss_newton_step(at, columns, prior_precision(candidate, columns.shape[1]), self.estimate.values)
