@@ -281,11 +281,12 @@ def _all_columns(candidates: list[Candidate]) -> FloatArray:
 def _strongest_single_fits(given: SearchInput, first: MeanSearch, together: list[SelectedEffect]) -> list[_SingleFit] | None:
     """The effects that alone explain most, refitted without linearising, best first.
 
-    None where the linearised model is good enough: its error is smaller than the gain of any selected effect.
+    None where the linearised model is good enough: no effect is strong, or its error is below the gain of any selected one.
     """
     found: list[_SingleFit] = []
     tolerance = min([thresholds().mean.class_margin, *(_ABSORBED_SHARE * each.log_likelihood_ratio for each in together)])
-    for candidate in first.leading_effects():
+    leading = first.leading_effects()
+    for candidate in leading:
         alone = _single_fit(given, first, candidate)
         if alone is None:
             continue
@@ -295,7 +296,7 @@ def _strongest_single_fits(given: SearchInput, first: MeanSearch, together: list
             return None
         found.append(alone)
     if not found:
-        return []
+        return [] if leading else None
     likeliest = _best_variants(given, first, found)
     return _with_alternatives(given, first, likeliest, set(likeliest[0].estimate.chosen.indistinguishable))
 
