@@ -204,7 +204,7 @@ def _in_short(rows: list[Json]) -> str:
     said.append(
         "\nFor simulated measurements the goal is to name a wrong effect in 2 % of the cases at most. "
         f"In {len(spoiled)} of the {len(known)} good answers on effects of the catalogue the verdict is still `unknown`, because "
-        "the measurement disagreed with its model before the injection already.\n\nIn the next table each row is a group of "
+        "the measurement disagrees with its model even without the injection.\n\nIn the next table each row is a group of "
         'injections: by their signal-to-noise ratio S/N, or by the measurement (both are explained below). "Number" is the '
         "size of the group, and the other columns count [the outcomes](#how-answers-are-scored). Right and class are good "
         "outcomes."

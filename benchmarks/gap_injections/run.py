@@ -155,7 +155,7 @@ def before_injection(case: Case, out: Path) -> BeforeInjection:
 
 
 def missing_noise(case: Case, out: Path) -> float:
-    """Return by how much to multiply an injected noise, so that model and measurement have the same noise with it.
+    """Return the factor on an injected noise that makes it equal to all the noise that the model lacks.
 
     The injection adds the variance after - before, in units of the predicted one, but the model lacks after - 1.
     """

@@ -183,7 +183,8 @@ class ChangesThresholds(ThresholdGroup):
         0.2,
         "share of the wall",
         "If at least this share moved, the verdict is insufficient_data and no effect is named. If a noise term was named, as "
-        "much must have moved beside that noise. A larger region is not taken for a compact change.",
+        "much must have moved beside that noise. A larger region is not taken for a compact change. If changes and outliers are "
+        "at least this share, an effect is sought with which they are less than half as many.",
         "six walls of which a third moved: 0.22 to 0.31 beside a noise term; next to nothing beside a true noise",
         le=1,
     )

@@ -467,11 +467,11 @@ def _maximum(heights: Sequence[Callable[[], float]]) -> tuple[int, float]:
 
 
 def _scale(matrix: FloatArray) -> FloatArray:
-    """(..., k) factors that scale the columns of normal equations (..., k, k) to size 1; 0 for absent ones."""
+    """(..., k) factors that scale the diagonal of normal equations (..., k, k) to 1; 0 for columns that vanish."""
     size = np.sqrt(np.diagonal(matrix, axis1=-2, axis2=-1))
     return np.divide(1.0, size, out=np.zeros_like(size), where=size > _NOTHING * size.max(axis=-1, keepdims=True))
 
 
 def _regularised(matrix: FloatArray, scale: FloatArray) -> FloatArray:
-    """Scaled normal equations (..., k, k) with a small ridge."""
+    """Scale normal equations (..., k, k) by such factors, and add a small ridge so that they can always be solved."""
     return np.asarray(matrix * (scale[..., :, None] * scale[..., None, :]) + _RIDGE * np.eye(scale.shape[-1]))

@@ -20,7 +20,7 @@ from scene.geometry.mesh import FloatArray
 _FEWEST_POINTS = 3_000
 """Points of the subsample: at least this many, if there are so many, and less than twice as many. They suffice for a ranking."""
 _REFINING_STEPS = 5
-"""Gauss-Newton steps by which the size of a large effect is refined."""
+"""Most Gauss-Newton steps by which the size of an effect is refined."""
 
 
 def gauss_newton_step(at: Residuals, columns: FloatArray, precision: FloatArray, values: FloatArray) -> FloatArray:
@@ -83,9 +83,9 @@ def screen_effects(measurement: Measurement, part: Residuals, candidates: Sequen
     possible = [(each, fit) for each, fit in screened if fit is not None and np.isfinite(fit.noise_left)]
     found = []
     for candidate, fit in sorted(possible, key=lambda item: item[1].noise_left)[:count]:
-        best = fit
-        for _ in range(_REFINING_STEPS):
-            best = best.improved(points, few) or best
+        best, steps = fit, 0
+        while steps < _REFINING_STEPS and (better := best.improved(points, few)) is not None:
+            best, steps = better, steps + 1
         found.append((best.noise_left, estimate_of_size(candidate, best.estimate.values)))
     return [estimate for _, estimate in sorted(found, key=lambda item: item[0])]
 
@@ -122,7 +122,7 @@ class _ScreenedEffect:
         return cls.of(measurement, part, estimate_of_size(candidate, size))
 
     def improved(self, measurement: Measurement, part: Residuals) -> _ScreenedEffect | None:
-        """Return the fit after one Gauss-Newton step on the points that are no outliers now; None if it is no better."""
+        """Change the size by a Gauss-Newton step, computed without the outliers; None if this does not reduce the noise left."""
         z = self.value / self.residuals.sigma
         good = self.residuals.usable & (np.abs(z) < thresholds().points.outlier_sigmas * max(nmad(z, 0.0), 1.0))
         at, candidate = self.residuals.part(good), self.estimate.candidate

@@ -333,7 +333,7 @@ def _with_alternatives(given: SearchInput, first: MeanSearch, alone: list[_Singl
 def _single_fit(
     given: SearchInput, first: MeanSearch, candidate: Candidate, values: FloatArray | None = None
 ) -> _SingleFit | None:
-    """One effect in the model, at some coefficients; None: at those of the linearised fit."""
+    """Put one effect into the model. values: its coefficients; None: those of the linearised fit."""
     (estimate,) = _estimates_of(first, [first.selected_alone(candidate)])
     return _SingleFit.of(given, first, estimate if values is None else replace(estimate, values=values))
 

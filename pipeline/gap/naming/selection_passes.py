@@ -212,7 +212,7 @@ class SelectionPass:
 
 @dataclass(frozen=True, eq=False)
 class PassInputs:
-    """Makes inputs of a search for sensor errors, which differ in the edge effects that are in the sensor model.
+    """Prepares the input of a search for sensor errors, with any choice of edge effects in the sensor model.
 
     Edge effects are errors at depth steps: edge fattening, smoothing, filled occlusions and the beam footprint. Other errors
     can hide or imitate them, so they are searched again beside the errors that a search has named.
@@ -235,7 +235,7 @@ class PassInputs:
 
     @cached_property
     def large_effect(self) -> NamedEffect | None:
-        """An effect of the catalogue so large that without it much of the rock would count as changed; None if there is none.
+        """A sensor error so large that much of the rock counts as changed while the model lacks it; None if there is none.
 
         It is searched if a search would exclude as large a share of the points as the threshold `changes.moved_share`. The effect
         that alone makes the residuals smallest is the reason if the share is less than half as large beside it.
@@ -245,13 +245,16 @@ class PassInputs:
             return None
         part = subsample(self.measurement, self.plain, np.flatnonzero(self.plain.usable & ~self._held_out))
         candidates = [each for each in catalogue_families(*part) if isinstance(each, Candidate)]
-        found = [effect_from_estimate(each, part[1]) for each in screen_effects(*part, candidates, 1)]
-        beside = [PassInput.of(self.measurement, self.plain, self.held_out_points, [], each) for each in found]
-        return next((each for each, given in zip(found, beside, strict=True) if 2 * given.excluded_share < excluded), None)
+        for estimate in screen_effects(*part, candidates, 1):
+            effect = effect_from_estimate(estimate, part[1])
+            beside = PassInput.of(self.measurement, self.plain, self.held_out_points, [], effect)
+            if 2 * beside.excluded_share < excluded:
+                return effect
+        return None
 
     @property
     def _held_out(self) -> BoolArray:
-        """(n,) points with a residual that are kept for validation."""
+        """(n,) true for points of the plain residuals that are kept for validation."""
         return self.held_out_points[self.plain.index]
 
     def edge_effects(self) -> list[EdgeEffect]:
@@ -290,7 +293,7 @@ class PassInputs:
 
 
 def select_beside_edge_effects(inputs: PassInputs, random: KeyedRandom, excluded: frozenset[tuple[str, bool]]) -> SelectionPass:
-    """Search for sensor errors beside the effects at depth steps (edge effects) that the residuals show.
+    """Search for sensor errors, with those effects at depth steps (edge effects) in the model that the residuals show.
 
     Other errors can hide or imitate edge effects. These are therefore searched again with the named errors in the model; if
     others show then, the search for errors is repeated beside them.
