@@ -191,7 +191,7 @@ def select_and_refit(given: SearchInput, first: MeanSearch) -> SearchOutcome:
     joint = search_at_joint_fit(given)
     found = [_search_beside(given, linear) or linear]
     if beside_best is not None:
-        found.insert(0, beside_best)
+        found.insert(0 if alone else 1, beside_best)
     if joint is not None and joint.chosen:
         found.append(_search_beside(given, joint) or joint)
     possible = [each for each in found if not out_of_bounds(given.measurement, each.estimates, each.residuals)]
@@ -296,7 +296,8 @@ def _strongest_single_fits(given: SearchInput, first: MeanSearch, together: list
             return None
         found.append(alone)
     if not found:
-        return [] if leading else None
+        simple = len(together) == 1 and not together[0].candidate.empirical
+        return None if simple and not leading else []
     likeliest = _best_variants(given, first, found)
     return _with_alternatives(given, first, likeliest, set(likeliest[0].estimate.chosen.indistinguishable))
 
