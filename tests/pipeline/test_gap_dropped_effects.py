@@ -34,7 +34,9 @@ def test_what_one_of_two_true_effects_leaves_is_significant(tmp_path: Path, monk
     monkeypatch.setattr(nonlinear_refit, "candidate_families", _few)
     there, residuals, _ = align(read_measurement(tmp_path))
     part = residuals.part(residuals.usable)
-    named, result = effect_selection.select_effects(there, part, fit_pose_robustly(part)[2], KeyedRandom(1))
+    named, result = effect_selection.select_effects(
+        effect_selection.SelectionInput(there, part, fit_pose_robustly(part)[2], KeyedRandom(1))
+    )
     systematic = [item for item in named if not item.adds_variance]
     assert {item.name for item in systematic} == {f"tls.{name}" for name in TRUE}
     both = result.p_value_given(systematic)

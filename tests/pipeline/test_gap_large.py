@@ -26,11 +26,13 @@ from pipeline.gap.naming.effect_screening import screen_effects
 from pipeline.gap.naming.named_effects import NamedEffect, effect_from_estimate
 from pipeline.gap.naming.nonlinear_refit import (
     SearchInput,
+    SearchOutcome,
     _screened_single_fits,
     _strongest_single_fits,
     _with_equivalence_class,
     fit_jointly,
     search_at_joint_fit,
+    select_and_refit,
 )
 from pipeline.gap.naming.search_residuals import with_fitted_variance
 from pipeline.gap.naming.selection_passes import PassInput, PassInputs
@@ -211,6 +213,33 @@ def test_slopes_do_not_serve_where_what_they_miss_is_as_much_as_something_gains(
     assert refitted(one, 1.5)
     assert not refitted(two, 3, 3)
     assert refitted(two, 3, 1.5)
+
+
+def test_effects_are_tried_one_by_one_where_several_weak_ones_seem_needed(
+    turned_and_zoomed: tuple[SearchInput, dict[str, dict[str, Any]]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The explanation so found replaces the linear one only if it has fewer effects."""
+    points, _ = turned_and_zoomed
+    first = MeanSearch(with_fitted_variance(points.part, [], 1.0), points.families, KeyedRandom(1))
+    chosen = first.select()[0]
+    assert len(chosen) > 1
+    monkeypatch.setattr(first, "leading_effects", list)
+    assert _strongest_single_fits(points, first, chosen[:1]) is None
+    assert _strongest_single_fits(points, first, chosen) == []
+    tried: list[SearchOutcome] = []
+
+    def beside_best(given: SearchInput, linear: SearchOutcome, alone: list[Any]) -> SearchOutcome:
+        assert given is points
+        assert alone
+        tried.append(replace(linear, estimates=linear.estimates[: len(linear.estimates) - fewer]))
+        return tried[-1]
+
+    monkeypatch.setattr(nonlinear_refit, "_search_beside_best", beside_best)
+    monkeypatch.setattr(nonlinear_refit, "_search_beside", lambda *_: None)
+    monkeypatch.setattr(nonlinear_refit, "search_at_joint_fit", lambda _: None)
+    for fewer in (0, 1):
+        found = select_and_refit(points, first)
+        assert (found is tried[-1]) == (fewer > 0)
 
 
 def test_the_effect_that_leaves_the_least_noise_ranks_first(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

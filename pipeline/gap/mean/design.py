@@ -401,12 +401,15 @@ class Design:
         shares : (f,) share of each signature's norm that is left then, from 0 to 1.
         """
         row = self.ranked_covariances[0]
-        names, matrices = [], []
+        names: list[str] = []
+        matrices = []
         for name, (plain, sines) in self.families.by_name.items():
             candidate = self.families.plain[plain[0]] if plain else self.families.sine(sines[len(sines) // 2])
             if not candidate.empirical:
                 names.append(name)
                 matrices.append(candidate.columns[self.model.rows, :1] * self.model.inverse_sigma[:, None])
+        if not names:
+            return [], np.zeros((0, 0)), np.zeros(0)
         whole = np.concatenate(matrices, axis=1)
         weight = self.equations.covariances[row].weight[:, None]
         grams = []

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
 
 from pipeline.change.robust import nmad
 from pipeline.formats.measurements.measurement import Measurement, StereoMeasurement
+from pipeline.gap.mean.candidates import Candidate, SineGrid
 from pipeline.gap.mean.detection_power import DetectableSize
 from pipeline.gap.mean.nonparametric_terms import LINE_PATTERN, SPATIAL_NULL
 from pipeline.gap.mean.search import MeanSearch
@@ -118,15 +120,42 @@ class SelectionResult:
         return self.p_value_beside(kept) if kept else self.p_without_effects
 
 
-def select_effects(
-    measurement: Measurement,
-    part: Residuals,
-    noise_ratio: float,
-    random: KeyedRandom,
-    excluded: frozenset[tuple[str, bool]] = frozenset(),
-    grid_noise: VarianceTerm | None = None,
-    noise: FloatArray | None = None,
-) -> tuple[list[NamedEffect], SelectionResult]:
+@dataclass(frozen=True)
+class SelectionInput:
+    """Input of a selection of sensor errors (effects).
+
+    Attributes
+    ----------
+    measurement : the training points (those that are not kept for validation), with their sensor model.
+    part : residuals of these n points, measured minus predicted.
+    noise_ratio : observed over predicted standard deviation of these residuals.
+    random : source of random numbers for the null distributions.
+    excluded : effects that are not tried, as pairs (name, whether it is an empirical term); `NONPARAMETRIC_TERMS` stands for
+        all empirical terms.
+    noise : (n,) what is left of the residuals beside an error that is so large that most of the residuals would look like noise;
+        noise terms are fitted to it. None: the registered residuals.
+    grid_noise : noise that neighbouring points share, if a preceding selection found it in its residuals. It is then part of
+        the model from the start, because it imitates empirical terms and errors of the reference. None in a first selection.
+    """
+
+    measurement: Measurement
+    part: Residuals
+    noise_ratio: float
+    random: KeyedRandom
+    excluded: frozenset[tuple[str, bool]] = frozenset()
+    noise: FloatArray | None = None
+    grid_noise: VarianceTerm | None = None
+
+    def registered(self, part: Residuals) -> FloatArray:
+        """Return the (n,) residuals to which noise terms are fitted first. part: the residuals, with their predicted noise."""
+        return fit_pose_robustly(part)[0] if self.noise is None else self.noise
+
+    def without(self, families: frozenset[tuple[str, bool]]) -> SelectionInput:
+        """Return the input of a selection that does not try some further effects, given as pairs like `excluded`."""
+        return replace(self, excluded=self.excluded | families, grid_noise=None)
+
+
+def select_effects(given: SelectionInput) -> tuple[list[NamedEffect], SelectionResult]:
     """Find the systematic sensor errors and noise terms that explain the residuals of a measurement (forward selection).
 
     A linearised search finds systematic effects. They are put into the sensor model, residuals are computed again, and further
@@ -134,126 +163,181 @@ def select_effects(
     weight the next search. If the fitted value of an effect is implausible, the effect is excluded, and the selection is
     repeated.
 
-    Parameters
-    ----------
-    measurement : the training points (those that are not kept for validation), with their sensor model.
-    part : residuals of these points, measured minus predicted.
-    noise_ratio : observed over predicted standard deviation of these residuals.
-    random : source of random numbers for the null distributions.
-    excluded : effects that are not tried, as pairs (name, whether it is an empirical term); `NONPARAMETRIC_TERMS` stands for
-        all empirical terms.
-    grid_noise : noise that neighbouring points share, if a preceding selection found it in its residuals. It is then part of
-        the model from the start, because it imitates empirical terms and errors of the reference. None in a first selection.
-    noise : (n,) what is left of the residuals beside an error that is so large that most of the residuals would look like noise;
-        noise terms are fitted to it. None: the registered residuals.
+    given : residuals of the training points, and what is not tried.
 
     Returns
     -------
     tuple : the effects that were found, and the scores and tests of the selection.
     """
-    named: list[NamedEffect] = []
-    all_residuals, initial_noise_ratio, added = part, noise_ratio, 0.0
-    left_beside = fit_pose_robustly(part)[0] if noise is None else noise
-    range_step = locking = None
-    if isinstance(part, TlsResiduals) and not model_has(measurement, RangeQuantization.tag()):
-        range_step = find_range_step(part.geometry.measured_m)
-    if isinstance(part, StereoResiduals) and not model_has(measurement, PixelLocking.tag()):
-        at = part.geometry
-        allowed = NoiseBounds(float(np.median(part.sigma)), nmad(left_beside))
-        locking = find_locking(at.found, at.disparity, at.tangent, at.infinity, allowed)
-    tiles_known = (TileShift.tag(), False) in excluded or model_has(measurement, TileShift.tag())
-    if isinstance(part, StereoResiduals) and not tiles_known:
-        seams = find_tile_seams(part, left_beside)
-        if seams is not None:
-            return _select_beside_tiles(measurement, part, effect_from_seams(seams), random, excluded)
-    if range_step is not None:
-        named.append(effect_from_range_step(range_step, part))
-        added, noise_ratio = range_step.step_m**2 / 12, 1.0
-    found_separately = set()
-    if locking is not None:
-        named.append(effect_from_locking(locking))
-        added = locking.amplitude_px**2 / 2
-        found_separately.add((PixelLocking.tag(), False))
-    part = with_added_variance(part, added)
-    out = excluded | found_separately
-    possible = (each for each in candidate_families(measurement, part) if (each.name, each.empirical) not in out)
-    families = [each for each in possible if not (each.empirical and NONPARAMETRIC_TERMS in out)]
-    if noise is None:
-        left_beside = fit_pose_robustly(part)[0]
-    noise_terms, variance_tried, note = _fit_variance(
-        measurement, part, WallCells.over(part.wall_xy), left_beside, random, excluded
-    )
-    if wrong := _implausible_variance(measurement, noise_terms):
-        return select_effects(measurement, all_residuals, initial_noise_ratio, random, excluded | wrong, noise=noise)
-    if not noise_terms and grid_noise is not None:
-        noise_terms = [grid_noise]
-
-    def variance_at(at: Residuals) -> list[VarianceTerm]:
-        fitted = _fit_variance(measurement, at, WallCells.over(at.wall_xy), fit_pose_robustly(at)[0], random, excluded)[0]
-        if fitted or grid_noise is None:
-            return fitted
-        return [replace(grid_noise, variance=grid_noise.variance[np.isin(part.index, at.index)])]
-
-    points = SearchInput(measurement, part, families, variance_at, added, random)
-    first = MeanSearch(with_fitted_variance(part, noise_terms, noise_ratio), families, random)
-    found = select_and_refit(points, first)
-    physical = any(not each.empirical for each in families)
-    names, cosines, survival = first.design.identifiability() if physical else ([], np.zeros((0, 0)), np.zeros(0))
-    wrong = out_of_bounds(measurement, found.estimates, found.residuals)
-    implausible = absorbed_by_registration(found.estimates, found.residuals, dict(zip(names, survival, strict=True)))
-    if implausible and not _explains_everything(found):
-        wrong |= implausible
+    measurement, random = given.measurement, given.random
+    tiles = _shifted_tiles(given)
+    if tiles is not None:
+        return _select_beside_tiles(given, tiles)
+    apart = _FoundApart.of(given)
+    part = with_added_variance(given.part, apart.variance)
+    noise = _FittedNoise.of(given, part, WallCells.over(part.wall_xy), given.registered(part))
+    if wrong := noise.implausible(measurement):
+        return select_effects(given.without(wrong))
+    families = _families(given, part, apart)
+    known = [] if given.grid_noise is None else [given.grid_noise]
+    search = SearchInput(measurement, part, families, partial(_noise_terms_at, given, part), apart.variance, random)
+    first = MeanSearch(with_fitted_variance(part, noise.terms or known, apart.noise_ratio), families, random)
+    found = select_and_refit(search, first)
+    names, _, survival = first.design.identifiability()
+    wrong = _implausible_effects(given, found, dict(zip(names, survival, strict=True)))
     design = found.search.design
     left = design.residuals_after([each.candidate for each in found.further])
     if found.chosen and not wrong:
-        noise_terms, variance_tried, note = _fit_variance(measurement, found.residuals, design.cells, left, random, excluded)
-    if noise_terms in ([], [grid_noise]) and (_GRID_NOISE, False) not in excluded:
-        match measurement, part, found.residuals:
-            case StereoMeasurement(model=model), StereoResiduals(), StereoResiduals():
-                noise_left, shared = find_grid_noise(found.residuals, left, model, random)
-                described = any(each.candidate.empirical for each in found.estimates)
-                if noise_left is not None and grid_noise is None:
-                    noise_in_all = find_grid_noise(part, left_beside, model, random)[0] if described else None
-                    refound = noise_in_all or noise_left.with_constant_variance(len(part))
-                    return select_effects(measurement, all_residuals, initial_noise_ratio, random, excluded, refound, noise)
-                kept = noise_left or (None if described else grid_noise)
-                noise_terms, note = ([], note or shared) if kept is None else ([kept], note)
-    if wrong := (wrong | _implausible_variance(measurement, noise_terms)) - excluded:
-        again, result = select_effects(measurement, all_residuals, initial_noise_ratio, random, excluded | wrong, noise=noise)
-        return keep_implausible_in_class(
-            again, found.chosen, frozenset(each.candidate.name for each in found.estimates), wrong
-        ), result
+        noise = _FittedNoise.of(given, found.residuals, design.cells, left)
+    if not noise.terms:
+        refound, noise = _with_grid_noise(given, part, found, left, noise)
+        if refound is not None:
+            return select_effects(replace(given, grid_noise=refound))
+    if wrong := (wrong | noise.implausible(measurement)) - given.excluded:
+        again, result = select_effects(given.without(wrong))
+        before = frozenset(each.candidate.name for each in found.estimates)
+        return keep_implausible_in_class(again, found.chosen, before, wrong), result
     systematic = [effect_from_estimate(each, found.residuals) for each in found.estimates]
-    named += systematic
-    named += [effect_from_variance(each, part.sensor) for each in noise_terms]
-    unexplained_noise = NoiseRatio(1.0, False) if noise_terms else NoiseRatio.of(found.residuals, design.cells, left, random)
-    said = (*_note_repetition(found.estimates), *_note_oblique_waves(found), *_note_most_similar(found, part))
-    notes = (*part.notes, *_note_left_out(excluded), *filter(None, [note]), *said)
-    p_value = found.search.goodness_of_fit_p_value(found.tried)
-    alone = first.score_families(()) if systematic else ()
-    p_without_effects = first.goodness_of_fit_p_value(alone) if alone else p_value
-    systematic_names = frozenset(each.name for each in systematic)
-    table = {"names": [f"{part.sensor}.{name}" for name in names], "cosines": cosines.tolist(), "survival": survival.tolist()}
-    tried = found.chosen[0].family_scores if found.chosen else found.tried
-    without_nulls = tuple(item for item in tried if not item.name.startswith(SPATIAL_NULL))
-    sigma = design.reference_sigma([each.candidate for each in found.further])
-    result = SelectionResult(
-        without_nulls,
-        tuple(variance_tried),
-        systematic_names,
-        p_value,
-        p_without_effects,
-        unexplained_noise,
-        notes,
-        table,
-        sigma,
-        lambda: _detectable_sizes(found, [each.effect for each in noise_terms], left, random),
-        lambda kept: _p_value_beside(points, found, kept),
-    )
+    result = _result(given, search, first, found, noise, left)
     angles = [each for each in systematic if each.effect is AngleEmpirical]
     if angles and not model_has(measurement, AngleEmpirical.tag()):
-        return _select_beside_angle_terms(measurement, all_residuals, angles, result, random, excluded)
-    return named, result
+        return _select_beside_angle_terms(given, angles, result)
+    return [*apart.named, *systematic, *(effect_from_variance(each, part.sensor) for each in noise.terms)], result
+
+
+def _shifted_tiles(given: SelectionInput) -> NamedEffect | None:
+    """Find shifts of a stereo matcher's tiles, unless the model has them or they are not to be tried."""
+    part, known = given.part, (TileShift.tag(), False) in given.excluded or model_has(given.measurement, TileShift.tag())
+    seams = find_tile_seams(part, given.registered(part)) if isinstance(part, StereoResiduals) and not known else None
+    return None if seams is None else effect_from_seams(seams)
+
+
+@dataclass(frozen=True)
+class _FoundApart:
+    """Rounded ranges or locked disparities, which are found before all other effects.
+
+    named: the effect; variance: variance of its error, squared unit of the observable; noise_ratio: observed over predicted
+    standard deviation beside it.
+    """
+
+    named: list[NamedEffect]
+    variance: float
+    noise_ratio: float
+
+    @classmethod
+    def of(cls, given: SelectionInput) -> _FoundApart:
+        """Find rounding and locking that the model does not have."""
+        part, measurement = given.part, given.measurement
+        if isinstance(part, TlsResiduals) and not model_has(measurement, RangeQuantization.tag()):
+            step = find_range_step(part.geometry.measured_m)
+            if step is not None:
+                return cls([effect_from_range_step(step, part)], step.step_m**2 / 12, 1.0)
+        if isinstance(part, StereoResiduals) and not model_has(measurement, PixelLocking.tag()):
+            at, allowed = part.geometry, NoiseBounds(float(np.median(part.sigma)), nmad(given.registered(part)))
+            locking = find_locking(at.found, at.disparity, at.tangent, at.infinity, allowed)
+            if locking is not None:
+                return cls([effect_from_locking(locking)], locking.amplitude_px**2 / 2, given.noise_ratio)
+        return cls([], 0.0, given.noise_ratio)
+
+
+@dataclass(frozen=True)
+class _FittedNoise:
+    """Noise terms that were fitted to residuals, the scores of all that were tried, and a note on variance that none explains."""
+
+    terms: list[VarianceTerm]
+    tried: list[VarianceScore]
+    note: str
+
+    @classmethod
+    def of(cls, given: SelectionInput, part: Residuals, cells: WallCells, value: FloatArray) -> _FittedNoise:
+        """Fit the noise. value: (n,) residuals after the systematic effects."""
+        names = frozenset(name for name, empirical in given.excluded if not empirical)
+        found, tried, note = fit_variance_model(part, cells, value, given.random, names)
+        match given.measurement, part:
+            case StereoMeasurement(), StereoResiduals():
+                found = separate_white_and_grid_noise(found, part, value, given.measurement.model)
+        return cls([each for each in found if each.effect not in names], tried, note)
+
+    def implausible(self, measurement: Measurement) -> frozenset[tuple[str, bool]]:
+        """Families of noise terms whose values are outside the bounds of their effect."""
+        entries = {each.effect: effect_from_variance(each, measurement.sensor).entry for each in self.terms}
+        return frozenset((name, False) for name, entry in entries.items() if not within_bounds(measurement.model, entry))
+
+
+def _families(given: SelectionInput, part: Residuals, apart: _FoundApart) -> list[Candidate | SineGrid]:
+    """Families of systematic effects to try."""
+    out = given.excluded | {(each.entry["name"], False) for each in apart.named}
+    possible = (each for each in candidate_families(given.measurement, part) if (each.name, each.empirical) not in out)
+    return [each for each in possible if not (each.empirical and NONPARAMETRIC_TERMS in out)]
+
+
+def _noise_terms_at(given: SelectionInput, part: Residuals, at: Residuals) -> list[VarianceTerm]:
+    """Fit noise terms to other residuals of some of the points of `part`; if none is found, the known grid noise remains."""
+    fitted = _FittedNoise.of(given, at, WallCells.over(at.wall_xy), fit_pose_robustly(at)[0]).terms
+    if fitted or given.grid_noise is None:
+        return fitted
+    return [replace(given.grid_noise, variance=given.grid_noise.variance[np.isin(part.index, at.index)])]
+
+
+def _implausible_effects(given: SelectionInput, found: SearchOutcome, survival: dict[str, float]) -> frozenset[tuple[str, bool]]:
+    """Families of systematic effects that are not to be tried, because their size is implausible."""
+    wrong = out_of_bounds(given.measurement, found.estimates, found.residuals)
+    absorbed = absorbed_by_registration(found.estimates, found.residuals, survival)
+    return wrong | absorbed if absorbed and not _explains_everything(found) else wrong
+
+
+def _with_grid_noise(
+    given: SelectionInput, part: Residuals, found: SearchOutcome, left: FloatArray, noise: _FittedNoise
+) -> tuple[VarianceTerm | None, _FittedNoise]:
+    """Search noise that neighbouring points share, where no other noise was found.
+
+    Returns
+    -------
+    The grid noise beside which the selection must be repeated, or None; and the noise with it.
+    """
+    if (_GRID_NOISE, False) in given.excluded:
+        return None, noise
+    match given.measurement, part, found.residuals:
+        case StereoMeasurement(model=model), StereoResiduals(), StereoResiduals():
+            noise_left, shared = find_grid_noise(found.residuals, left, model, given.random)
+            described = any(each.candidate.empirical for each in found.estimates)
+            if noise_left is not None and given.grid_noise is None:
+                in_all = find_grid_noise(part, given.registered(part), model, given.random)[0] if described else None
+                return in_all or noise_left.with_constant_variance(len(part)), noise
+            kept = noise_left or (None if described else given.grid_noise)
+            return None, replace(noise, terms=[] if kept is None else [kept], note=noise.note or (shared if kept is None else ""))
+    return None, noise
+
+
+def _result(
+    given: SelectionInput, search: SearchInput, first: MeanSearch, found: SearchOutcome, noise: _FittedNoise, left: FloatArray
+) -> SelectionResult:
+    """Return the scores and tests of a selection; left: (n,) residuals after its systematic effects."""
+    design, sensor = found.search.design, given.part.sensor
+    said = (*_note_repetition(found.estimates), *_note_oblique_waves(found), *_note_most_similar(found, given.part))
+    p_value = found.search.goodness_of_fit_p_value(found.tried)
+    alone = first.score_families(()) if found.estimates else ()
+    names, cosines, survival = first.design.identifiability()
+    tried = found.chosen[0].family_scores if found.chosen else found.tried
+    return SelectionResult(
+        tried=tuple(item for item in tried if not item.name.startswith(SPATIAL_NULL)),
+        variance_tried=tuple(noise.tried),
+        systematic=frozenset(f"{sensor}.{each.candidate.name}" for each in found.estimates),
+        p_value=p_value,
+        p_without_effects=first.goodness_of_fit_p_value(alone) if alone else p_value,
+        unexplained_noise=(
+            NoiseRatio(1.0, False) if noise.terms else NoiseRatio.of(found.residuals, design.cells, left, given.random)
+        ),
+        notes=(*given.part.notes, *_note_left_out(given.excluded), *filter(None, [noise.note]), *said),
+        identifiability={
+            "names": [f"{sensor}.{name}" for name in names],
+            "cosines": cosines.tolist(),
+            "survival": survival.tolist(),
+        },
+        reference_sigma=design.reference_sigma([each.candidate for each in found.further]),
+        detectable=lambda: _detectable_sizes(found, [each.effect for each in noise.terms], left, given.random),
+        p_value_beside=lambda kept: _p_value_beside(search, found, kept),
+    )
 
 
 def _p_value_beside(points: SearchInput, found: SearchOutcome, kept: frozenset[str]) -> float | None:
@@ -321,13 +405,9 @@ def keep_implausible_in_class(
     return found
 
 
-def _select_beside_tiles(
-    measurement: Measurement, part: Residuals, tiles: NamedEffect, random: KeyedRandom, excluded: frozenset[tuple[str, bool]]
-) -> tuple[list[NamedEffect], SelectionResult]:
+def _select_beside_tiles(given: SelectionInput, tiles: NamedEffect) -> tuple[list[NamedEffect], SelectionResult]:
     """Select effects with the shifts of tiles in the model."""
-    aligned, found, _ = aligned_with(measurement, [tiles], part.index)
-    at = at_points_of(found, part)
-    named, result = select_effects(aligned, at, fit_pose_robustly(at)[2], random, excluded)
+    named, result = select_effects(_beside(given, [tiles]))
 
     def beside(kept: frozenset[str]) -> float | None:
         return result.p_value_given([each for each in named if each.name in kept]) if tiles.name in kept else None
@@ -336,31 +416,31 @@ def _select_beside_tiles(
 
 
 def _select_beside_angle_terms(
-    measurement: Measurement,
-    all_residuals: Residuals,
-    angles: list[NamedEffect],
-    first: SelectionResult,
-    random: KeyedRandom,
-    excluded: frozenset[tuple[str, bool]],
+    given: SelectionInput, angles: list[NamedEffect], first: SelectionResult
 ) -> tuple[list[NamedEffect], SelectionResult]:
     """Repeat the selection with curves of an angle's error in the model: the linear model is wrong for a ray that turns far.
 
     What the second selection finds of the same form is added to the curves of the first.
     """
-    aligned, found, _ = aligned_with(measurement, angles, all_residuals.index)
-    at = at_points_of(found, all_residuals)
-    named, result = select_effects(aligned, at, fit_pose_robustly(at)[2], random.child("angles"), excluded)
-    joined, others = merge_angle_curves(angles, [item for item in named if item.effect is AngleEmpirical], all_residuals)
+    named, result = select_effects(replace(_beside(given, angles), random=given.random.child("angles")))
+    joined, others = merge_angle_curves(angles, [item for item in named if item.effect is AngleEmpirical], given.part)
     rest = [item for item in named if item.effect is not AngleEmpirical]
-    systematic = result.systematic | {item.name for item in angles}
     again = replace(
         result,
         tried=first.tried,
-        systematic=systematic,
+        systematic=result.systematic | {item.name for item in angles},
         p_without_effects=first.p_without_effects,
         identifiability=first.identifiability,
     )
     return [*joined, *others, *rest], again
+
+
+def _beside(given: SelectionInput, named: list[NamedEffect]) -> SelectionInput:
+    """Input of a selection with some effects in the model."""
+    aligned, found, _ = aligned_with(given.measurement, named, given.part.index)
+    at = at_points_of(found, given.part)
+    ratio = fit_pose_robustly(at)[2]
+    return replace(given, measurement=aligned, part=at, noise_ratio=ratio, noise=None, grid_noise=None)
 
 
 def _note_repetition(estimates: list[Estimate]) -> list[str]:
@@ -395,32 +475,6 @@ def _note_oblique_waves(found: SearchOutcome) -> list[str]:
         f"the residuals contain waves at an oblique angle that the reference's error model does not explain (p = {p_value:.2g}). "
         "No sensor effect is aligned like that; they are attributed to the reference"
     ]
-
-
-def _fit_variance(
-    measurement: Measurement,
-    part: Residuals,
-    cells: WallCells,
-    value: FloatArray,
-    random: KeyedRandom,
-    excluded: frozenset[tuple[str, bool]],
-) -> tuple[list[VarianceTerm], list[VarianceScore], str]:
-    """Fit the variance model: noise terms, what was tried, and a note on variance that no term explains.
-
-    value: (n,) residuals after the systematic effects.
-    """
-    names = frozenset(name for name, empirical in excluded if not empirical)
-    found, tried, note = fit_variance_model(part, cells, value, random, names)
-    match measurement, part:
-        case StereoMeasurement(), StereoResiduals():
-            found = separate_white_and_grid_noise(found, part, value, measurement.model)
-    return [each for each in found if each.effect not in names], tried, note
-
-
-def _implausible_variance(measurement: Measurement, noise_terms: list[VarianceTerm]) -> frozenset[tuple[str, bool]]:
-    """Families of noise terms whose values are outside the bounds of their effect."""
-    entries = {each.effect: effect_from_variance(each, measurement.sensor).entry for each in noise_terms}
-    return frozenset((name, False) for name, entry in entries.items() if not within_bounds(measurement.model, entry))
 
 
 def _note_left_out(excluded: frozenset[tuple[str, bool]]) -> list[str]:

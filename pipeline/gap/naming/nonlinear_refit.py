@@ -165,7 +165,8 @@ def select_and_refit(given: SearchInput, first: MeanSearch) -> SearchOutcome:
     The linearised model is inexact for a large effect, and forward selection then adds spurious effects that absorb the
     linearisation error. Several explanations are therefore compared. One is the linearised selection. For another, the strongest
     effects are refitted alone without linearising, and the selection is repeated with the best one in the model. If that still
-    needs several effects, all effects are refitted, and a third explanation is tried (`search_at_joint_fit`).
+    needs several effects, or if none is strong, each effect is tried alone like this (`screen_effects`), and all are fitted
+    together (`search_at_joint_fit`).
 
     Parameters
     ----------
@@ -263,8 +264,7 @@ def fit_jointly(given: SearchInput, candidates: list[Candidate]) -> tuple[Measur
             return None
         renewed = catalogue_families(measurement, at)
         candidates = [_recomputed(each, renewed) for each in candidates]
-    explained: FloatArray = _all_columns(candidates) @ values
-    return measurement, at, explained
+    return measurement, at, np.asarray(_all_columns(candidates) @ values)
 
 
 def _too_few_left(given: SearchInput, at: Residuals) -> bool:
@@ -274,14 +274,14 @@ def _too_few_left(given: SearchInput, at: Residuals) -> bool:
 
 def _all_columns(candidates: list[Candidate]) -> FloatArray:
     """Columns of all candidates side by side."""
-    columns: FloatArray = np.concatenate([each.columns for each in candidates], axis=1)
-    return columns
+    return np.asarray(np.concatenate([each.columns for each in candidates], axis=1))
 
 
 def _strongest_single_fits(given: SearchInput, first: MeanSearch, together: list[SelectedEffect]) -> list[_SingleFit] | None:
     """The effects that alone explain most, refitted without linearising, best first.
 
-    None where the linearised model is good enough: no effect is strong, or its error is below the gain of any selected one.
+    Empty if no effect is strong. None where the linearised model is good enough: its error is below the gain of any selected
+    effect, or only one is selected, which is not strong.
     """
     found: list[_SingleFit] = []
     tolerance = min([thresholds().mean.class_margin, *(_ABSORBED_SHARE * each.log_likelihood_ratio for each in together)])
@@ -296,10 +296,9 @@ def _strongest_single_fits(given: SearchInput, first: MeanSearch, together: list
             return None
         found.append(alone)
     if not found:
-        simple = len(together) == 1 and not together[0].candidate.empirical
-        return None if simple and not leading else []
-    likeliest = _best_variants(given, first, found)
-    return _with_alternatives(given, first, likeliest, set(likeliest[0].estimate.chosen.indistinguishable))
+        return None if not leading and [each.candidate.empirical for each in together] == [False] else []
+    best = _best_variants(given, first, found)
+    return _with_alternatives(given, first, best, set(best[0].estimate.chosen.indistinguishable))
 
 
 def _screened_single_fits(given: SearchInput, first: MeanSearch, alone: list[_SingleFit]) -> list[_SingleFit]:

@@ -13,7 +13,7 @@ from pipeline.formats.measurements.measurement import Measurement, StereoMeasure
 from pipeline.gap.mean.candidates import Candidate
 from pipeline.gap.naming.candidate_families import catalogue_families, model_has
 from pipeline.gap.naming.effect_screening import screen_effects
-from pipeline.gap.naming.effect_selection import SelectionResult, select_effects
+from pipeline.gap.naming.effect_selection import SelectionInput, SelectionResult, select_effects
 from pipeline.gap.naming.named_effects import (
     NamedEffect,
     aligned_with,
@@ -197,8 +197,8 @@ class SelectionPass:
         """
         given = pass_input
         noise = None if given.large_effect is None else given.registered_residuals[given.training_rows]
-        found = select_effects(*given.training_part, given.noise_ratio, random, excluded, noise=noise)
-        return cls(given, *found)
+        selected = select_effects(SelectionInput(*given.training_part, given.noise_ratio, random, excluded, noise))
+        return cls(given, *selected)
 
     @property
     def edge_effect_names(self) -> set[str]:
