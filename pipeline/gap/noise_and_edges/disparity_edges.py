@@ -19,7 +19,7 @@ from pipeline.gap.noise_and_edges.edge_effects import EdgeEffect, WallBlocks, lo
 from pipeline.gap.residuals.alignment import AlignedMeasurement, align, compute_residuals, fit_pose_robustly
 from pipeline.gap.residuals.disparity_raster import DisparityRaster
 from pipeline.gap.residuals.residuals import BoolArray, Residuals
-from pipeline.gap.residuals.stereo_residuals import StereoResiduals
+from pipeline.gap.residuals.stereo_residuals import StereoResiduals, with_surroundings
 from pipeline.gap.thresholds import thresholds
 from scene.common.threads import map_in_threads
 from scene.geometry.mesh import FloatArray
@@ -29,6 +29,8 @@ from sensors.effects.occlusion_fill import OcclusionFill
 from sensors.effects.raster_effect import RasterEffect
 from sensors.effects.smoothing import Smoothing
 
+_TRIED = 50_000
+"""Points at which values of an effect's parameters are tried: at least so many if there are so many, and less than twice."""
 _RADII = (1, 2, 3, 4, 5, 6, 8, 10)
 _RIM_STEPS, _WINDOW_STEPS_PX = (2.0, 4.0), (0.5, 1.0, 2.0, 4.0)
 _SIGMAS = (0.5, 0.7, 1.0, 1.4, 2.0, 2.8, 4.0, 5.6, 8.0, 11.0)
@@ -105,6 +107,14 @@ class _EdgeData:
             held_out[points],
             known,
         ), points
+
+    def for_trials(self) -> _EdgeData:
+        """Return the data at evenly spaced ones of many points, at which values of an effect's parameters are tried."""
+        every = slice(None, None, max(len(self.sigma) // _TRIED, 1))
+        part = self.residuals.part(np.arange(len(self.sigma))[every])
+        raster = replace(self.raster, row=self.raster.row[every], column=self.raster.column[every])
+        values = (each[every] for each in (self.disparity, self.registered_residuals, self.sigma))
+        return _EdgeData(part, raster, *values, WallBlocks.over(part.wall_xy), self.held_out[every], self.beside)
 
     @cached_property
     def shift_without(self) -> FloatArray:
@@ -205,11 +215,22 @@ def find_disparity_edge_effects(
     if raster is None:
         return []
     data, points = _EdgeData.of(measurement, raster, residuals, registered_residuals, held_out)
-    known_effects = data.beside
+    found = _search(data)
+    if len(points) == len(registered_residuals):
+        return found
+    before = ([*data.beside, *(each.effect for each in found[:count])] for count in range(len(found)))
+    return [
+        replace(each, touched=_unpredictable_points(each.effect, others, raster, residuals))
+        for each, others in zip(found, before, strict=True)
+    ]
+
+
+def _search(data: _EdgeData) -> list[EdgeEffect]:
+    """Find the edge effects of some data, each beside those found before."""
     found: list[EdgeEffect] = []
 
     def smoothing(untouched: _EdgeData) -> EdgeEffect | None:
-        touched = np.any([np.zeros(len(points), dtype=bool), *(each.touched for each in found)], axis=0)
+        touched = np.any([np.zeros(len(untouched.sigma), dtype=bool), *(each.touched for each in found)], axis=0)
         return _find_smoothing(replace(untouched, held_out=untouched.held_out | touched))
 
     searches: dict[str, _EffectSearch] = {
@@ -217,10 +238,10 @@ def find_disparity_edge_effects(
         Smoothing.tag(): smoothing,
         OcclusionFill.tag(): _find_filling,
     }
-    for name in {effect.name for effect in known_effects}:
+    for name in {effect.name for effect in data.beside}:
         del searches[name]
     while searches:
-        current = replace(data, beside=[*known_effects, *(each.effect for each in found)])
+        current = replace(data, beside=[*data.beside, *(each.effect for each in found)])
         results = zip(searches, map_in_threads(partial(_run_search, current), searches.values()), strict=True)
         # no prediction is exact, so a further effect must explain more than the inexact part of those before
         needed = thresholds().mean.class_share * max([0.0, *(each.gain for each in found)])
@@ -231,14 +252,7 @@ def find_disparity_edge_effects(
         likelier = [current.likelier(similar)] if similar else []
         found.append(max([*likelier, *tried.values()], key=lambda each: each.gain))
         del searches[found[-1].name]
-    if len(points) == len(registered_residuals):
-        return found
-    effects = [*known_effects, *(each.effect for each in found)]
-    before = (effects[: len(known_effects) + count] for count in range(len(found)))
-    return [
-        replace(each, touched=_unpredictable_points(each.effect, others, raster, residuals))
-        for each, others in zip(found, before, strict=True)
-    ]
+    return found
 
 
 def align_beside_fattening(
@@ -262,10 +276,11 @@ def align_beside_fattening(
     """
     if not aligned.pose.any() or any(isinstance(effect, EdgeFattening) for effect in measurement.model.effects):
         return aligned
+    measurement = with_surroundings(measurement, initial)
     given, plain = _gather_trusted(measurement, initial, trusted), _gather_trusted(*aligned[:2], trusted)
     if given is None or plain is None:
         return aligned
-    best, least = most_likely_fattening(given), thresholds().edges.least_gain
+    best, least = most_likely_fattening(given.for_trials()), thresholds().edges.least_gain
     if given.registered_density([best]).sum() < plain.registered_density([]).sum() + least:
         return aligned
     fattened = measurement.changed(model=measurement.model.model_copy(update={"effects": (*measurement.model.effects, best)}))
@@ -290,12 +305,9 @@ def _gather_trusted(measurement: Measurement, residuals: Residuals, trusted: NDA
 def _log_likelihood_with_edge_effects(aligned: AlignedMeasurement, trusted: NDArray[np.int64]) -> float:
     """Log-likelihood of the trusted points at a pose, with the edge effects that are found there."""
     data = _gather_trusted(aligned.measurement, aligned.residuals, trusted)
-    measurement, residuals = aligned.measurement, aligned.residuals
-    if data is None or not isinstance(measurement, StereoMeasurement) or not isinstance(residuals, StereoResiduals):
+    if data is None:
         return -np.inf
-    registered = fit_pose_robustly(residuals)[0]
-    found = find_disparity_edge_effects(measurement, residuals, registered, ~np.isin(residuals.index, trusted))
-    density = data.registered_density([each.effect for each in found])
+    density = data.registered_density([each.effect for each in _search(data)])
     return float(density.sum() / max(np.count_nonzero(~data.held_out), 1) * len(trusted))
 
 
@@ -345,7 +357,7 @@ def _find_fattening(data: _EdgeData) -> EdgeEffect | None:
 
     Radii are whole cells, because the radii in between do the same.
     """
-    best = most_likely_fattening(data)
+    best = most_likely_fattening(data.for_trials())
 
     def of_radius(cells: float) -> EdgeFattening:
         return best.model_copy(update={"radius_px": (cells + _ROUNDED_CELLS[0]) * data.raster.step})
@@ -408,21 +420,22 @@ def most_likely_fattening(data: _EdgeData) -> EdgeFattening:
 
 def _find_smoothing(data: _EdgeData) -> EdgeEffect | None:
     """Find a low-pass, with the standard deviation of largest likelihood."""
-    step = data.raster.step
+    few, step = data.for_trials(), data.raster.step
 
-    def gains(sigma: float) -> FloatArray:
-        return data.gains(Smoothing(sigma_px=sigma))
+    def gains(sigma: float, at: _EdgeData) -> FloatArray:
+        return at.gains(Smoothing(sigma_px=sigma))
 
-    sigma = maximise_gain(gains, [step * each for each in _SIGMAS], _REFINEMENT_FACTORS)
-    if data.blocks.total_if_agreed(gains(sigma)) is None:
+    sigma = maximise_gain(partial(gains, at=few), [step * each for each in _SIGMAS], _REFINEMENT_FACTORS)
+    if data.blocks.total_if_agreed(gains(sigma, data)) is None:
         return None
     for _ in range(_REGISTRATIONS):  # the first registration and noise estimate absorb part of the low-pass
-        data = data.registered_with(Smoothing(sigma_px=sigma))
-        sigma = maximise_gain(gains, [sigma], _REFINEMENT_FACTORS)
-    gain = data.blocks.total_if_agreed(gains(sigma))
+        few = few.registered_with(Smoothing(sigma_px=sigma))
+        sigma = maximise_gain(partial(gains, at=few), [sigma], _REFINEMENT_FACTORS)
+    data = data.registered_with(Smoothing(sigma_px=sigma))
+    gain = data.blocks.total_if_agreed(gains(sigma, data))
     if gain is None:
         return None
-    std = float(np.hypot(data.blocks.std(gains, sigma), _SMOOTHING_UNCERTAINTY * sigma))
+    std = float(np.hypot(data.blocks.std(partial(gains, at=data), sigma), _SMOOTHING_UNCERTAINTY * sigma))
     return data.edge_effect(Smoothing(sigma_px=sigma), {"sigma_px": std}, gain)
 
 
