@@ -201,7 +201,6 @@ def test_slopes_do_not_serve_where_what_they_miss_is_as_much_as_something_gains(
     monkeypatch.setattr(first, "leading_effects", lambda: [leading.estimate.candidate])
     monkeypatch.setattr(nonlinear_refit, "_single_fit", lambda *_: leading)
     monkeypatch.setattr(nonlinear_refit, "_best_variants", lambda *_: [leading])
-    monkeypatch.setattr(nonlinear_refit, "_with_alternatives", lambda _points, _first, alone, _names: alone)
 
     def refitted(wrong_by: float, *ratios: float) -> bool:
         mean = Thresholds().mean.model_copy(update={"class_margin": 2 * wrong_by})

@@ -297,8 +297,7 @@ def _strongest_single_fits(given: SearchInput, first: MeanSearch, together: list
         found.append(alone)
     if not found:
         return None if not leading and [each.candidate.empirical for each in together] == [False] else []
-    best = _best_variants(given, first, found)
-    return _with_alternatives(given, first, best, set(best[0].estimate.chosen.indistinguishable))
+    return _best_variants(given, first, found)
 
 
 def _screened_single_fits(given: SearchInput, first: MeanSearch, alone: list[_SingleFit]) -> list[_SingleFit]:
@@ -311,23 +310,6 @@ def _screened_single_fits(given: SearchInput, first: MeanSearch, alone: list[_Si
     for each in _ranked_on_common_points([*alone, *_best_variants(given, first, more)], first):
         best.setdefault(each.name, each)
     return list(best.values())
-
-
-def _with_alternatives(given: SearchInput, first: MeanSearch, alone: list[_SingleFit], names: set[str]) -> list[_SingleFit]:
-    """Add single fits of further effects, and of those that the linearised search cannot tell from the best; best first.
-
-    Of each effect the variant with the parameters that the linearised search prefers is used, in every camera.
-    """
-    others = {item.name: item.candidate.names for item in first.score_families(()) if not item.empirical and item.name in names}
-    for each in alone:
-        others.pop(each.name, None)
-    plain = (each for each in first.design.families.plain if not each.empirical)
-    variants = [each for each in plain if each.names == others.get(each.name)]
-    more = [each for each in (_single_fit(given, first, variant) for variant in variants) if each is not None]
-    if not more:
-        return alone
-    ranked = _ranked_on_common_points([*alone, *_best_variants(given, first, more)], first)
-    return _with_alternatives(given, first, ranked, set(ranked[0].estimate.chosen.indistinguishable))
 
 
 def _single_fit(

@@ -113,8 +113,9 @@ class _EdgeData:
         every = slice(None, None, max(len(self.sigma) // _TRIED, 1))
         part = self.residuals.part(np.arange(len(self.sigma))[every])
         raster = replace(self.raster, row=self.raster.row[every], column=self.raster.column[every])
-        values = (each[every] for each in (self.disparity, self.registered_residuals, self.sigma))
-        return _EdgeData(part, raster, *values, WallBlocks.over(part.wall_xy), self.held_out[every], self.beside)
+        disparity, registered, sigma = (each[every] for each in (self.disparity, self.registered_residuals, self.sigma))
+        blocks = WallBlocks.over(part.wall_xy)
+        return _EdgeData(part, raster, disparity, registered, sigma, blocks, self.held_out[every], self.beside)
 
     @cached_property
     def shift_without(self) -> FloatArray:
