@@ -148,11 +148,11 @@ def _covariance_of_nodes(place: NDArray[np.int64], table: FloatArray) -> FloatAr
     number = np.full(np.ptp(place, axis=0) + 1 + 2 * margin, -1)
     inside = place - corner + margin
     number[tuple(inside.T)] = np.arange(len(place))
+    row, column = (each.ravel() for each in np.indices(table.shape))
+    other = number[inside[:, :1] + margin - row, inside[:, 1:] + margin - column]
+    node, offset = np.nonzero(other >= 0)
     matrix = np.zeros((len(place), len(place)))
-    for (row, column), covariance in np.ndenumerate(table):
-        other = number[inside[:, 0] + margin - row, inside[:, 1] + margin - column]
-        there = other >= 0
-        matrix[np.flatnonzero(there), other[there]] = covariance
+    matrix[node, other[node, offset]] = table.ravel()[offset]
     return matrix
 
 
