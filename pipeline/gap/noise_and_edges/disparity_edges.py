@@ -288,7 +288,8 @@ def align_beside_fattening(
     pose = align(fattened, trusted, compute_residuals(fattened)).pose
     moved = measurement.moved(pose)
     there = AlignedMeasurement(moved, compute_residuals(moved), pose)
-    before, after = (_log_likelihood_with_edge_effects(each, trusted) for each in (aligned, there))
+    both = plain, _gather_trusted(*there[:2], trusted)
+    before, after = (_log_likelihood_with_edge_effects(each, len(trusted)) for each in both)
     return there if after > before + least else aligned
 
 
@@ -303,13 +304,12 @@ def _gather_trusted(measurement: Measurement, residuals: Residuals, trusted: NDA
     return _EdgeData.of(measurement, raster, residuals, fit_pose_robustly(residuals)[0], held_out)[0]
 
 
-def _log_likelihood_with_edge_effects(aligned: AlignedMeasurement, trusted: NDArray[np.int64]) -> float:
-    """Log-likelihood of the trusted points at a pose, with the edge effects that are found there."""
-    data = _gather_trusted(aligned.measurement, aligned.residuals, trusted)
+def _log_likelihood_with_edge_effects(data: _EdgeData | None, count: int) -> float:
+    """Log-likelihood of `count` trusted points at a pose, with the edge effects that are found there; `data`: at that pose."""
     if data is None:
         return -np.inf
     density = data.registered_density([each.effect for each in _search(data)])
-    return float(density.sum() / max(np.count_nonzero(~data.held_out), 1) * len(trusted))
+    return float(density.sum() / max(np.count_nonzero(~data.held_out), 1) * count)
 
 
 def _run_search(data: _EdgeData, search: _EffectSearch) -> EdgeEffect | None:
