@@ -154,7 +154,9 @@ def test_two_effects_that_only_make_up_for_each_other_both_fail(tmp_path: Path, 
 
 
 def test_blocks_agree_on_an_effect_only_if_more_gain_than_chance_allows() -> None:
-    """Of gains that are as often negative, one in ten sets passes (10 +- 2 %, false failure 0.3 %), however heavy the tails.
+    """If an effect gains and loses equally often, 10 % of the tests accept it (tolerance 2 %, false-failure rate 0.3 %).
+
+    This holds for heavy-tailed gains too.
 
     One block that gains much does not suffice. Gains of all blocks do, however different, also of as few as two.
     """

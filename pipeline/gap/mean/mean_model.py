@@ -473,5 +473,5 @@ def _scale(matrix: FloatArray) -> FloatArray:
 
 
 def _regularised(matrix: FloatArray, scale: FloatArray) -> FloatArray:
-    """Scale normal equations (..., k, k) by such factors, and add a small ridge so that they can always be solved."""
+    """Scale normal equations (..., k, k) by factors (..., k), and add a small ridge so that they can always be solved."""
     return np.asarray(matrix * (scale[..., :, None] * scale[..., None, :]) + _RIDGE * np.eye(scale.shape[-1]))

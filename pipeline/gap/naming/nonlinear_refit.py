@@ -315,7 +315,7 @@ def _screened_single_fits(given: SearchInput, first: MeanSearch, alone: list[_Si
 def _single_fit(
     given: SearchInput, first: MeanSearch, candidate: Candidate, values: FloatArray | None = None
 ) -> _SingleFit | None:
-    """Put one effect into the model. values: its coefficients; None: those of the linearised fit."""
+    """Put one effect into the sensor model. values: (k,) its coefficients; None: those of the linearised fit."""
     (estimate,) = _estimates_of(first, [first.selected_alone(candidate)])
     return _SingleFit.of(given, first, estimate if values is None else replace(estimate, values=values))
 

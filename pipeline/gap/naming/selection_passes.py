@@ -230,7 +230,7 @@ class PassInputs:
 
     @cached_property
     def _without_effects(self) -> PassInput:
-        """Input of a search without edge effects, and without a large one."""
+        """Input of a search with neither edge effects nor a large effect in the sensor model."""
         return PassInput.of(self.measurement, self.plain, self.held_out_points, [])
 
     @cached_property
