@@ -250,23 +250,25 @@ class RayCaster:
         """
         return label_of_nearest_vertex(self._vertices, self._face_vertices, hits.face, hits.valid, point, labels)
 
-    def cast(self, origins: FloatArray, directions: FloatArray) -> tuple[FloatArray, IntArray]:
+    def cast(self, origins: FloatArray, directions: FloatArray, *, coherent: bool = False) -> tuple[FloatArray, IntArray]:
         """Cast n rays given as NumPy arrays and return where they hit the mesh first.
 
         Parameters
         ----------
-        origins : (n, 3) array
-            Starts of the rays, m.
+        origins : (n, 3) or (3,) array
+            Starts of the rays, or the common start of all, m.
         directions : (n, 3) array
             Directions of the rays.
+        coherent : bool
+            Whether neighbouring rays are nearly parallel, which the ray tracer exploits.
 
         Returns
         -------
         (n,) array and (n,) int array
             Distances in lengths of the direction vectors, and face numbers; NaN and -1 for a miss.
         """
-        rays = (vectors_on_device(np.broadcast_to(array, directions.shape)) for array in (origins, directions))
-        hits = self.intersect(*rays, coherent=False)
+        origin = mi.Array3f64(*(dr.opaque(mi.Float64, x) for x in origins)) if origins.ndim == 1 else vectors_on_device(origins)
+        hits = self.intersect(origin, vectors_on_device(directions), coherent=coherent)
         distance = dr.select(hits.valid, hits.distance, np.nan)
         face = dr.select(hits.valid, mi.Int32(hits.face), -1)
         dr.eval(distance, face)

@@ -73,7 +73,7 @@ def test_a_window_that_takes_the_nearest_rock_is_found_beside_its_pose(
     assert named.effect.radius_px == pytest.approx(cells * step, abs=2 * named.std["radius_px"])
     inputs = PassInputs(found.measurement, found.residuals, np.zeros(len(there.cloud.points), dtype=bool))
     selection: Any = None
-    (again,) = inputs.edge_effects_given(SelectionPass(inputs.with_these(inputs.edge_effects()), [], selection))
+    (again,) = inputs.edge_effects_given(SelectionPass(inputs.with_these(inputs.edge_effects), [], selection))
     assert isinstance(again.effect, EdgeFattening)
     assert (again.effect.window, again.effect.radius_px) == ("square", named.effect.radius_px), "it starts from the first pose"
 

@@ -107,7 +107,7 @@ def test_the_score_on_held_out_blocks_is_the_density_of_all_points_together() ->
     value = multivariate_normal(np.zeros(count), together).rvs(random_state=4)
     other = multivariate_normal(np.zeros(count), together).rvs(random_state=5)
     scores = [
-        _RegisteredResiduals(each, np.full(count, SIGMA), shared).log_score(np.arange(count), patch, reference)
+        _RegisteredResiduals(each, np.full(count, SIGMA), shared).log_score(np.arange(count), field, patch, reference)
         for each in (value, other)
     ]
     expected = [multivariate_normal(np.zeros(count), together).logpdf(each) for each in (value, other)]

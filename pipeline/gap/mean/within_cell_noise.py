@@ -12,7 +12,6 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import sparse
 from scipy.linalg import cho_solve, cholesky, solve_triangular
-from scipy.linalg.lapack import dpotri
 
 from pipeline.gap.residuals.correlated_noise import NodeField
 from scene.common.keyed_random import KeyedRandom
@@ -62,9 +61,8 @@ class WithinCellNoise:
         if not nodes.shape[1]:
             return cls(1.0, nodes, means, field.covariance, field.covariance)
         white = max(1 - field.variance * float(np.mean(inverse_sigma**2)), _LEAST_WHITE)
-        prior = cholesky(field.covariance, lower=True)
-        matrix = (nodes.T @ nodes).toarray() - means.T @ means + white * inverse_from_cholesky(prior)
-        return cls(white, nodes, means, prior, cholesky(matrix, lower=True))
+        matrix = (nodes.T @ nodes).toarray() - means.T @ means + white * field.precision
+        return cls(white, nodes, means, field.root, cholesky(matrix, lower=True))
 
     def mean_covariance(self) -> FloatArray:
         """Return the (m, m) covariance of the noise in the means of m cells of the wall.
@@ -155,12 +153,3 @@ class WithinCellNoise:
             own = solve_triangular(self.prior, own, lower=True, trans="T")
         shared = self.nodes[rows].T @ white - self.means.T @ cell_sums
         return self.solve(own - shared / np.sqrt(self.white))
-
-
-def inverse_from_cholesky(root: FloatArray) -> FloatArray:
-    """Return the inverse of a symmetric positive definite (q, q) matrix, such as a covariance, from its Cholesky factor.
-
-    root: (q, q) lower Cholesky factor L; the matrix is L L'.
-    """
-    half = np.tril(dpotri(root, lower=True)[0])
-    return np.asarray(half + np.tril(half, -1).T)

@@ -164,9 +164,8 @@ def select_and_refit(given: SearchInput, first: MeanSearch) -> SearchOutcome:
 
     The linearised model is inexact for a large effect, and forward selection then adds spurious effects that absorb the
     linearisation error. Several explanations are therefore compared. One is the linearised selection. For another, the strongest
-    effects are refitted alone without linearising, and the selection is repeated with the best one in the model. If that still
-    needs several effects, or if none is strong, each effect is tried alone like this (`screen_effects`), and all are fitted
-    together (`search_at_joint_fit`).
+    effects are refitted alone without linearising, and the selection is repeated beside the best one. If that still needs several
+    effects, or if none is strong, each effect is tried alone (`screen_effects`), and all together (`search_at_joint_fit`).
 
     Parameters
     ----------
@@ -189,14 +188,34 @@ def select_and_refit(given: SearchInput, first: MeanSearch) -> SearchOutcome:
             beside_best = _search_beside_best(given, linear, screened) or beside_best
     if beside_best is not None and len(beside_best.estimates) == 1:
         return beside_best
-    joint = search_at_joint_fit(given)
-    found = [_search_beside(given, linear) or linear]
-    if beside_best is not None:
-        found.insert(0 if alone else 1, beside_best)
-    if joint is not None and joint.chosen:
-        found.append(_search_beside(given, joint) or joint)
-    possible = [each for each in found if not out_of_bounds(given.measurement, each.estimates, each.residuals)]
-    return min(possible, key=lambda each: each.complexity, default=linear)
+    best = beside_best if beside_best is not None and _within_bounds(given, beside_best) else None
+    best = _simpler(given, best, linear, ties=not alone)
+    if best is None or best.complexity > (0, 1):
+        best = _simpler(given, best, search_at_joint_fit(given), ties=False)
+    return best or linear
+
+
+def _simpler(given: SearchInput, best: SearchOutcome | None, other: SearchOutcome | None, ties: bool) -> SearchOutcome | None:
+    """Return the simpler of two explanations, the second one with what a search beside its effects adds.
+
+    That search only adds effects, so it is left out where the second explanation cannot be simpler.
+    best: the first explanation; None if there is none. ties: whether the second one is returned if both are equally simple.
+    """
+    if other is None or not other.chosen:
+        return best
+
+    def wins(complexity: tuple[int, int]) -> bool:
+        return best is None or complexity < best.complexity or (ties and complexity == best.complexity)
+
+    if not wins((0, sum(not each.candidate.empirical for each in other.estimates))):
+        return best
+    other = _search_beside(given, other) or other
+    return other if wins(other.complexity) and _within_bounds(given, other) else best
+
+
+def _within_bounds(given: SearchInput, outcome: SearchOutcome) -> bool:
+    """Whether a sensor model accepts the effects of an explanation."""
+    return not out_of_bounds(given.measurement, outcome.estimates, outcome.residuals)
 
 
 def search_at_joint_fit(given: SearchInput) -> SearchOutcome | None:

@@ -257,8 +257,9 @@ class PassInputs:
         """(n,) true for points of the plain residuals that are kept for validation."""
         return self.held_out_points[self.plain.index]
 
+    @cached_property
     def edge_effects(self) -> list[EdgeEffect]:
-        """Find the effects at depth steps (edge effects) that the residuals show beside a large effect, if there is one."""
+        """The effects at depth steps (edge effects) that the residuals show beside a large effect, if there is one."""
         if self.large_effect is None:
             return _find_edge_effects(self.measurement, self.plain, self.held_out_points)
         return self._edge_effects_beside([self.large_effect], [])
@@ -304,7 +305,7 @@ def select_beside_edge_effects(inputs: PassInputs, random: KeyedRandom, excluded
     random : source of random numbers for the null distributions.
     excluded : sensor errors that are not tried, as pairs (name, whether it is an empirical term).
     """
-    found = SelectionPass.of(inputs.with_these(inputs.edge_effects()), random, excluded)
+    found = SelectionPass.of(inputs.with_these(inputs.edge_effects), random, excluded)
     if not found.named:
         return found
     # a small error of the rays' directions looks like smoothing

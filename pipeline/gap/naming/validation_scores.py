@@ -13,11 +13,10 @@ from scipy.sparse import csr_array
 
 from pipeline.change.robust import nmad
 from pipeline.formats.measurements.measurement import Measurement
-from pipeline.gap.mean.within_cell_noise import inverse_from_cholesky
 from pipeline.gap.naming.named_effects import NamedEffect, aligned_with
 from pipeline.gap.noise_and_edges.sign_flips import DRAWS
 from pipeline.gap.residuals.alignment import fit_pose
-from pipeline.gap.residuals.correlated_noise import GridCorrelatedNoise
+from pipeline.gap.residuals.correlated_noise import GridCorrelatedNoise, NodeField
 from pipeline.gap.residuals.residuals import BoolArray, Residuals
 from pipeline.gap.residuals.wall_blocks import wall_block_numbers, wall_blocks_by_points
 from pipeline.gap.thresholds import thresholds
@@ -168,7 +167,7 @@ class _RegisteredResiduals:
     sigma: FloatArray
     shared: GridCorrelatedNoise
 
-    def log_score(self, rows: NDArray[np.int64], patch: NDArray[np.int64], reference_sigma: float) -> float:
+    def log_score(self, rows: NDArray[np.int64], field: NodeField, patch: NDArray[np.int64], reference_sigma: float) -> float:
         """Return the Gaussian log score of some rows, without its constant.
 
         Each patch of the wall shares one error of the reference, and neighbours share grid-correlated noise. The covariance is
@@ -177,11 +176,11 @@ class _RegisteredResiduals:
         Parameters
         ----------
         rows : (k,) rows to score.
+        field : the grid-correlated noise at these rows.
         patch : (k,) number of the patch in which each row lies.
         reference_sigma : standard deviation of the reference error of a patch, in the observable's unit.
         """
         value, sigma = self.value[rows], self.sigma[rows]
-        field = self.shared.part(rows).node_field(len(rows))
         nodes, own = field.weights, np.maximum(sigma**2 - field.variance, _LEAST_WHITE_SHARE * sigma**2)
         total = np.bincount(patch, 1 / own)
         mean = np.bincount(patch, value / own) / total
@@ -195,11 +194,10 @@ class _RegisteredResiduals:
         size = np.sum(np.log(own)) - np.sum(np.log1p(-shrinkage * total))
         if nodes.shape[1]:
             matrix = (nodes.T @ nodes.multiply(1 / own[:, None]) - node_sums.T @ node_sums.multiply(shrinkage[:, None])).toarray()
-            prior = cholesky(field.covariance, lower=True)
-            root = cholesky(matrix + inverse_from_cholesky(prior), lower=True)
+            root = cholesky(matrix + field.precision, lower=True)
             right = nodes.T @ weighed - node_sums.T @ (shrinkage * sums)
             square -= np.sum(solve_triangular(root, right, lower=True) ** 2)
-            size += 2 * np.sum(np.log(np.diag(root)) + np.log(np.diag(prior)))
+            size += 2 * np.sum(np.log(np.diag(root)) + np.log(np.diag(field.root)))
         return float(-0.5 * (square + size))
 
 
@@ -221,9 +219,10 @@ def _log_score_gains(
     found = []
     for number in np.unique(block[chosen]):
         inside = block[chosen] == number
-        own_patch = np.unique(patch[inside], return_inverse=True)[1]
-        scores = (each.log_score(chosen[inside], own_patch, sigma) for each in (with_all, without))
-        found.append(next(scores) - next(scores))
+        own_patch, own_rows = np.unique(patch[inside], return_inverse=True)[1], chosen[inside]
+        fields = {each.effects: each.part(own_rows).node_field(len(own_rows)) for each in (with_all.shared, without.shared)}
+        after, before = (each.log_score(own_rows, fields[each.shared.effects], own_patch, sigma) for each in (with_all, without))
+        found.append(after - before)
     return np.array(found)
 
 

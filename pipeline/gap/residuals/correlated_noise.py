@@ -4,11 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
+from scipy.linalg import cholesky
+from scipy.linalg.lapack import dpotri
 
 from scene.geometry.mesh import FloatArray
 from sensors.effects.matching_noise import MatchingNoise, NodeNoise
@@ -41,7 +44,18 @@ class NodeField:
     weights: sparse.csr_array
     covariance: FloatArray
 
-    @property
+    @cached_property
+    def root(self) -> FloatArray:
+        """(q, q) lower Cholesky factor of the covariance of the nodes' values, px."""
+        return np.asarray(cholesky(self.covariance, lower=True))
+
+    @cached_property
+    def precision(self) -> FloatArray:
+        """(q, q) inverse covariance of the nodes' values, 1/px², for Woodbury's identity."""
+        half = np.tril(dpotri(self.root, lower=True)[0])
+        return np.asarray(half + np.tril(half, -1).T)
+
+    @cached_property
     def variance(self) -> float:
         """Variance of the grid-correlated noise at a point, averaged over a sample of the points, px².
 

@@ -21,7 +21,7 @@ from sensors.effects.smoothing import LowPass, Smoothing
 
 MOST_CELLS, _AT_ONCE = 40_000_000, 2_000_000
 """Most cells of a raster (as many as the largest cameras have pixels), and how many of them are traced at once."""
-_SEARCHED, _BANDS, _LEAST_ROWS = 400_000, 4, 64
+_SEARCHED, _BANDS, _LEAST_ROWS = 200_000, 4, 64
 """Most cells among which edge effects are searched; a larger raster is searched in this many bands of at least so many rows."""
 _MARGIN = 32
 """Cells beyond the outermost points: three standard deviations of the widest low-pass filter that is searched for."""
@@ -84,7 +84,7 @@ class DisparityRaster:
         for part in np.array_split(np.arange(len(rows)), -(-disparity.size // _AT_ONCE)):
             u, v = (x.ravel() for x in np.meshgrid(columns, rows[part]))
             ray = pixel_rays(left, u, v)
-            point = left.position + measurement.scene.cast(left.position, ray)[0][:, None] * ray
+            point = left.position + measurement.scene.cast(left.position, ray, coherent=True)[0][:, None] * ray
             seen, hidden = np.isfinite(point).all(axis=1), is_hidden(measurement.scene, right.position, point)
             matched = seen & ~hidden & _in_image(right, point)
             found = np.full(len(u), np.nan)
@@ -108,7 +108,7 @@ class DisparityRaster:
 
         Returns
         -------
-        raster : The whole raster if it has at most 400,000 cells, else four bands of its rows. Empty rows between the bands
+        raster : The whole raster if it has at most 200,000 cells, else four bands of its rows. Empty rows between the bands
             keep them from affecting each other. In rows without points `hidden` is not valid.
         points : (k,) row numbers of those of the n measured points that lie in it.
         """
@@ -238,8 +238,9 @@ def apply_smoothing(effects: Iterable[Effect], geometry: PixelGeometry, columns:
     -------
     (n, k) smoothed changes; unchanged without smoothing, if the pixels lie on no raster, or if it has over 40 million cells.
     """
-    filters, step = [effect for effect in effects if isinstance(effect, Smoothing)], raster_cell_px(geometry.u, geometry.v)
-    if not filters or step is None or raster_cell_count(geometry.u, geometry.v, step) > MOST_CELLS:
+    filters = [effect for effect in effects if isinstance(effect, Smoothing)]
+    step = raster_cell_px(geometry.u, geometry.v) if filters else None
+    if step is None or raster_cell_count(geometry.u, geometry.v, step) > MOST_CELLS:
         return columns
     row, column = _cell(geometry.v, step), _cell(geometry.u, step)
     matched = np.zeros((int(row.max()) + 1, int(column.max()) + 1), dtype=bool)
@@ -318,7 +319,7 @@ def raster_spacing_px(u: FloatArray) -> float | None:
     -------
     The spacing, px; None if the pixels lie on no raster.
     """
-    gaps = np.diff(np.unique(np.round(u, 3)))
+    gaps = np.diff(np.unique(np.rint(1000 * u).astype(np.int64))) / 1000  # integers are quicker to tell apart
     step = float(np.median(gaps)) if len(gaps) > 10 else 0.0
     steps = gaps / max(step, 1e-9)
     if step > 0.9 and np.count_nonzero(np.abs(steps - np.rint(steps)) < 0.01) > 0.99 * len(gaps):

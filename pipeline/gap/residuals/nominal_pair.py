@@ -138,9 +138,11 @@ class NominalPair:
         (n,) disparities, px; NaN for pixels that see nothing.
         """
         left, right = (self.pair.left, self.pair.right) if real is None else (real.left, real.right)
-        ray = pixel_rays(left, u, v)
-        point = left.position + scene.cast(left.position, ray)[0][:, None] * ray
-        return self.disparity((u, v), project(right, point))
+        pixel = on_device(mi.Float64, u), on_device(mi.Float64, v)
+        origin, ray = vector(left.position), _ray(left, *pixel)
+        hits = scene.intersect(origin, ray, coherent=True)
+        point = origin + dr.select(hits.valid, hits.distance, dr.nan) * ray
+        return _on_host(self.left_column(*pixel) - self.right_column(*_pixel(right, point)))[0]
 
     def left_column(self, u: mi.Float64, v: mi.Float64) -> mi.Float64:
         """Transform pixels of the left image to the rectified image, and return their columns, px: one half of a disparity.
@@ -258,6 +260,32 @@ def _on_host(*columns: mi.Float64) -> list[FloatArray]:
     return [np.array(column) for column in columns]
 
 
+def steps_from_planes(
+    scene: RayCaster, camera: Camera, u: FloatArray, v: FloatArray, height: FloatArray, normal: FloatArray
+) -> FloatArray:
+    """Compare the inverse depths of the surface at some pixels with those of planes, to find edges.
+
+    Parameters
+    ----------
+    scene : The surface, in the wall frame, prepared for ray tracing.
+    camera : The camera with its pose in the wall frame.
+    u, v : (n, k) columns and rows of k pixels for each of n planes, px.
+    height : (n,) heights of the planes above the camera: scalar product of the normal with the way from the camera, m.
+    normal : (n, 3) unit normals of the planes, wall frame.
+
+    Returns
+    -------
+    (n, k) inverse depth of the surface minus that of the plane, along the camera's axis, 1/m; NaN where nothing is hit.
+    """
+    plane = dr.arange(mi.UInt32, u.size) // u.shape[1]
+    heights, normals = (on_device(mi.Float64, each) for each in (height, normal))
+    ray = _ray(camera, on_device(mi.Float64, u), on_device(mi.Float64, v))
+    hits = scene.intersect(vector(camera.position), ray, coherent=True)
+    seen = dr.select(hits.valid, hits.distance, dr.nan)
+    flat = dr.gather(mi.Float64, heights, plane) / dr.dot(ray, dr.gather(mi.Array3f64, normals, plane))
+    return _on_host(1 / seen - 1 / flat)[0].reshape(u.shape)
+
+
 def is_hidden(scene: RayCaster, position: FloatArray, points: FloatArray) -> BoolArray:
     """Tell which points a camera does not see, because the surface itself lies in front of them (occlusions).
 
@@ -273,7 +301,7 @@ def is_hidden(scene: RayCaster, position: FloatArray, points: FloatArray) -> Boo
     """
     back = np.nan_to_num(points, nan=1e9) - position
     length = np.linalg.norm(back, axis=1)
-    return np.asarray(scene.cast(position, back / length[:, None])[0] < length * (1 - _HIDDEN_SHARE))
+    return np.asarray(scene.cast(position, back / length[:, None], coherent=True)[0] < length * (1 - _HIDDEN_SHARE))
 
 
 def predict_disparities(nominal: NominalPair, real: Iterable[CameraPair], geometry: PixelGeometry) -> list[FloatArray]:

@@ -108,15 +108,15 @@ def cast_rays(measurement: TlsMeasurement, axes: list[FloatArray]) -> RayHits:
     The hits, in the order of the rays.
     """
     ray, scene, position = axes[0], measurement.scene, measurement.station[0]
-    distance, face = scene.cast(position, ray)
+    distance, face = scene.cast(position, ray, coherent=True)
     face = np.maximum(face, 0)
     normal = scene.mesh.normals[face]
-    curvature = np.zeros(len(ray))
-    for axis in axes[1:]:
-        flat = range_derivative(normal, ray, axis, distance)
-        for step in (_PROBE_RAD, -_PROBE_RAD):
-            beside = scene.cast(position, ray + step * axis)[0]
-            curvature = np.maximum(curvature, np.nan_to_num(np.abs(beside - distance - step * flat), nan=np.inf))
+    sides = _PROBE_RAD * np.stack([axes[1], -axes[1], axes[2], -axes[2]], axis=1)
+    beside = scene.cast(position, (ray[:, None] + sides).reshape(-1, 3), coherent=True)[0].reshape(-1, 4)
+    slopes = (range_derivative(normal, ray, axis, distance) for axis in axes[1:])
+    flat = _PROBE_RAD * np.stack([sign * slope for slope in slopes for sign in (1, -1)], axis=1)
+    bend = np.nan_to_num(np.abs(beside - distance[:, None] - flat), nan=np.inf)
+    curvature = bend.max(axis=1, initial=0.0)
     found = RayHits(distance, normal, np.abs(np.einsum("ni,ni->n", ray, normal)), curvature)
     if measurement.planes is None and not measurement.reference_error_m:
         return found

@@ -67,7 +67,18 @@ def select_rows(columns: _Columns, rows: Rows) -> _Columns:
     rows : Row numbers, a mask (n,) or a slice.
     """
     values: dict[str, Any] = {column.name: getattr(columns, column.name) for column in fields(columns)}
-    return replace(columns, **{name: value[rows] for name, value in values.items() if value is not None})
+    kept = _without_mask(rows)
+    return replace(columns, **{name: _rows_of(value, kept) for name, value in values.items() if value is not None})
+
+
+def _without_mask(rows: Rows) -> NDArray[np.int64] | slice:
+    """Replace a mask by its row numbers, which are found once for many arrays."""
+    return rows if isinstance(rows, slice) else np.flatnonzero(rows) if rows.dtype == bool else np.asarray(rows, dtype=np.int64)
+
+
+def _rows_of(values: NDArray[Any], rows: NDArray[np.int64] | slice) -> NDArray[Any]:
+    """Rows of an array (n, ...). `take` copies rows of several values two to four times faster than indexing does."""
+    return values[rows] if isinstance(rows, slice) else values.take(rows, axis=0)
 
 
 @dataclass(frozen=True)
@@ -199,20 +210,16 @@ class Residuals(ABC):
 
     def part(self, rows: Rows) -> Self:
         """Return the residuals of a subset of the n points, given as row numbers, a mask (n,) or a slice."""
+        kept = _without_mask(rows)
+        names = ("value", "sigma", "unit_m", "usable", "on_smooth_surface", "pose_jacobian", "wall_xy", "index")
+        columns: dict[str, Any] = {name: _rows_of(getattr(self, name), kept) for name in names}
         return replace(
             self,
-            value=self.value[rows],
-            sigma=self.sigma[rows],
-            unit_m=self.unit_m[rows],
-            usable=self.usable[rows],
-            on_smooth_surface=self.on_smooth_surface[rows],
-            pose_jacobian=self.pose_jacobian[rows],
-            wall_xy=self.wall_xy[rows],
-            covariates={name: values[rows] for name, values in self.covariates.items()},
-            index=self.index[rows],
-            geometry=self.geometry.part(rows),
-            epoch_offset=None if self.epoch_offset is None else self.epoch_offset[rows],
-            correlated_noise=self.correlated_noise.part(rows),
+            **columns,
+            covariates={name: _rows_of(values, kept) for name, values in self.covariates.items()},
+            geometry=self.geometry.part(kept),
+            epoch_offset=None if self.epoch_offset is None else _rows_of(self.epoch_offset, kept),
+            correlated_noise=self.correlated_noise.part(kept),
         )
 
     def with_rows_from(self, known: BoolArray, other: Self) -> Self:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import reduce
 
 import numpy as np
 
@@ -25,6 +26,7 @@ from pipeline.gap.residuals.nominal_pair import (
     predict_disparities,
     project,
     real_pair,
+    steps_from_planes,
 )
 from pipeline.gap.residuals.residuals import Residuals
 from pipeline.registration.rigid import RigidTransform
@@ -100,22 +102,22 @@ def move_onto_rays(left: Camera, points: FloatArray, u: FloatArray, v: FloatArra
     found, centre = RigidTransform.identity(), points.mean(axis=0)
     for _ in range(_REGISTRATION_STEPS):
         moved = found.apply(points[some])
-        miss = _reprojection_error(left, moved, u[some], v[some])
         units = _NUDGE * np.eye(6)
-        nudges = [RigidTransform.about(centre, unit[3:], unit[:3]) for unit in units]
-        jacobian = np.stack(
-            [(_reprojection_error(left, nudge.apply(moved), u[some], v[some]) - miss) / _NUDGE for nudge in nudges], axis=1
-        )
-        change = np.asarray(np.linalg.lstsq(jacobian, -miss, rcond=None)[0], dtype=np.float64)
+        nudged = [moved, *(RigidTransform.about(centre, unit[3:], unit[:3]).apply(moved) for unit in units)]
+        miss, *misses = _reprojection_errors(left, nudged, u[some], v[some])
+        jacobian = np.stack([(each - miss) / _NUDGE for each in misses], axis=1)
+        change = np.asarray(np.linalg.lstsq(jacobian.T @ jacobian, -jacobian.T @ miss, rcond=None)[0], dtype=np.float64)
         found = RigidTransform.about(centre, change[3:], change[:3]).after(found)
-    before, after = (np.sqrt(np.mean(_reprojection_error(left, each, u, v) ** 2)) for each in (points, found.apply(points)))
+    everywhere = _reprojection_errors(left, [points, found.apply(points)], u, v)
+    before, after = np.sqrt(np.mean(everywhere**2, axis=1))
     return found.apply(points) if after < _ON_RAY * before else points
 
 
-def _reprojection_error(left: Camera, points: FloatArray, u: FloatArray, v: FloatArray) -> FloatArray:
-    """(2 n,) projected minus given pixels, columns first, px."""
-    found = project(left, points)
-    return np.concatenate([found[0] - u, found[1] - v])
+def _reprojection_errors(left: Camera, clouds: list[FloatArray], u: FloatArray, v: FloatArray) -> FloatArray:
+    """(k, 2 n) projected minus given pixels of the same points at k places, columns first, px."""
+    projected = project(left, np.concatenate(clouds))
+    columns, rows = (each.reshape(len(clouds), -1) for each in projected)
+    return np.concatenate([columns - u, rows - v], axis=1)
 
 
 def stereo_residuals(measurement: StereoMeasurement) -> StereoResiduals:
@@ -129,7 +131,8 @@ def stereo_residuals(measurement: StereoMeasurement) -> StereoResiduals:
     measured = nominal.disparity(project(nominal.pair.left, points), project(nominal.pair.right, points))
     real = real_pair(model.effects, measurement)
     geometry, depth = _reference(nominal, real, measurement.scene, u, v, measured)
-    about = _surroundings(measurement, nominal, real, geometry, depth)
+    cell_px = raster_cell_px(u, v)
+    about = _surroundings(measurement, nominal, real, geometry, depth, cell_px or 1.0)
     along_row, along_column = about.gradient.T
     geometry = replace(geometry, along_row=along_row, along_column=along_column)
     geometry = replace(geometry, shaped=_shaped_px(measurement, geometry))
@@ -150,7 +153,7 @@ def stereo_residuals(measurement: StereoMeasurement) -> StereoResiduals:
         index=np.arange(len(u)),
         geometry=geometry,
         correlated_noise=GridCorrelatedNoise.of(model, np.stack([u, v], axis=1)),
-        notes=(*measurement.notes, *_notes(_has_pixels(measurement), u, v)),
+        notes=(*measurement.notes, *_notes(_has_pixels(measurement), u, v, cell_px)),
     )
     return whole if hit.all() else whole.part(hit)
 
@@ -191,13 +194,12 @@ def _pixels(nominal: NominalPair, measurement: StereoMeasurement) -> tuple[Float
     return u, v, move_onto_rays(left, points, u, v)
 
 
-def _notes(given: bool, u: FloatArray, v: FloatArray) -> tuple[str, ...]:
+def _notes(given: bool, u: FloatArray, v: FloatArray, cell_px: float | None) -> tuple[str, ...]:
     """Notes that name the candidates which were left out. `given`: whether the pixels were recorded."""
-    step = raster_cell_px(u, v)
-    large = step is not None and raster_cell_count(u, v, step) > MOST_CELLS
+    large = cell_px is not None and raster_cell_count(u, v, cell_px) > MOST_CELLS
     absent = {
         "no pixel_x, pixel_y: pixels were computed by projecting the points": not given,
-        "pixels on no raster: edge_fattening, smoothing and occlusion_fill were not tested": step is None,
+        "pixels on no raster: edge_fattening, smoothing and occlusion_fill were not tested": cell_px is None,
         f"a raster of more than {MOST_CELLS:,} cells: edge_fattening, smoothing and occlusion_fill were not tested": large,
         "no images: texture_noise was not tested": True,
     }
@@ -210,7 +212,7 @@ def _reference(
     """What the pixels of the `real` cameras see: their geometry on the reference, and the depth (n,), m."""
     left, camera = real.left, real.right
     ray = pixel_rays(left, u, v)
-    distance, face = scene.cast(left.position, ray)
+    distance, face = scene.cast(left.position, ray, coherent=True)
     point = left.position + distance[:, None] * ray
     right, normal = project(camera, point), scene.mesh.normals[np.maximum(face, 0)]
     geometry = PixelGeometry(
@@ -231,19 +233,24 @@ def _reference(
 
 
 def _surroundings(
-    measurement: StereoMeasurement, nominal: NominalPair, real: CameraPair, geometry: PixelGeometry, depth: FloatArray
+    measurement: StereoMeasurement,
+    nominal: NominalPair,
+    real: CameraPair,
+    geometry: PixelGeometry,
+    depth: FloatArray,
+    cell_px: float,
 ) -> Surroundings:
-    """Use the stored surroundings, and detect those of pixels that now see other places."""
+    """Use the stored surroundings, and detect those of pixels that now see other places. cell_px: spacing of the pixels."""
     known = measurement.surroundings or Surroundings.nowhere(len(geometry))
     away_px = nominal.geometry.f * np.linalg.norm(geometry.point - known.point, axis=1) / depth
     rows = np.flatnonzero(np.isfinite(depth) & ~(away_px < _STAYS_PX))
     if not len(rows):
         return known
-    moved = geometry.part(rows)
+    moved = geometry if len(rows) == len(geometry) else geometry.part(rows)
     edge = _edge_px(nominal, real.left, measurement.scene, moved)
     hidden = is_hidden(measurement.scene, real.right.position, moved.point)
-    step = raster_cell_px(geometry.u, geometry.v) or 1.0
-    return known.changed(rows, Surroundings(moved.point, edge, hidden, _gradient(nominal, real, measurement.scene, moved, step)))
+    gradient = _gradient(nominal, real, measurement.scene, moved, cell_px)
+    return known.changed(rows, Surroundings(moved.point, edge, hidden, gradient))
 
 
 def _gradient(nominal: NominalPair, real: CameraPair, scene: RayCaster, geometry: PixelGeometry, step: float) -> FloatArray:
@@ -251,32 +258,26 @@ def _gradient(nominal: NominalPair, real: CameraPair, scene: RayCaster, geometry
 
     A cell that sees nothing is left out: then the difference is one-sided, or 0 if both are missing.
     """
+    u, v = _four_neighbours(geometry, step)
+    disparity = nominal.surface_disparity(scene, u.ravel(), v.ravel(), real).reshape(u.shape)
+    right, left, below, above = (disparity - geometry.disparity[:, None]).T
+    sides = np.stack([[right, -left], [below, -above]]) / step
+    known = np.isfinite(sides)
+    return (np.where(known, sides, 0.0).sum(axis=1) / np.maximum(known.sum(axis=1), 1)).T
 
-    def change(du: float, dv: float) -> FloatArray:
-        u, v = geometry.u + du, geometry.v + dv
-        ray = pixel_rays(real.left, u, v)
-        point = real.left.position + scene.cast(real.left.position, ray)[0][:, None] * ray
-        return nominal.disparity((u, v), project(real.right, point)) - geometry.disparity
 
-    slopes = []
-    for du, dv in ((step, 0.0), (0.0, step)):
-        sides = np.stack([change(du, dv), -change(-du, -dv)]) / step
-        known = np.isfinite(sides)
-        slopes.append(np.where(known, sides, 0.0).sum(axis=0) / np.maximum(known.sum(axis=0), 1))
-    return np.stack(slopes, axis=1)
+def _four_neighbours(geometry: PixelGeometry, step: float) -> tuple[FloatArray, FloatArray]:
+    """(n, 4) columns and rows of the pixels `step` px to the right, to the left, below and above."""
+    columns, rows = step * np.array([[1.0, -1.0, 0.0, 0.0], [0.0, 0.0, 1.0, -1.0]])
+    return np.add.outer(geometry.u, columns), np.add.outer(geometry.v, rows)
 
 
 def _edge_px(nominal: NominalPair, left: Camera, scene: RayCaster, geometry: PixelGeometry) -> FloatArray:
     """(n,) largest deviation of the reference from its tangent plane at four neighbouring pixels, px of disparity."""
-    edge = np.zeros(len(geometry))
-    for du, dv in ((_PROBE_PX, 0.0), (-_PROBE_PX, 0.0), (0.0, _PROBE_PX), (0.0, -_PROBE_PX)):
-        beside = pixel_rays(left, geometry.u + du, geometry.v + dv)
-        seen = scene.cast(left.position, beside)[0]
-        flat = np.einsum("ni,ni->n", geometry.point - left.position, geometry.normal)
-        flat /= np.einsum("ni,ni->n", beside, geometry.normal)
-        step = nominal.geometry.f * nominal.geometry.base_m * (1 / seen - 1 / flat)
-        edge = np.maximum(edge, np.nan_to_num(np.abs(step), nan=_MOST_EDGE_PX))
-    return np.minimum(edge, _MOST_EDGE_PX)
+    height = np.einsum("ni,ni->n", geometry.point - left.position, geometry.normal)
+    beside = _four_neighbours(geometry, _PROBE_PX)
+    step = nominal.geometry.f * nominal.geometry.base_m * steps_from_planes(scene, left, *beside, height, geometry.normal)
+    return reduce(np.maximum, np.fmin(np.abs(step), _MOST_EDGE_PX).T)
 
 
 def _pose_jacobian(nominal: NominalPair, geometry: PixelGeometry) -> FloatArray:
