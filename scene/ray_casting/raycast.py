@@ -282,7 +282,7 @@ class RayCaster:
         """
         vertices = self.mesh.vertices[:: max(len(self.mesh.vertices) // _SIGHTS, 1)]
         sight = vertices - position
-        _, face = self.cast(position, sight)
+        _, face = self.cast(position, sight, coherent=True)
         met = face >= 0
         return face[met], np.einsum("ij,ij->i", self.mesh.face_normals(face[met]), sight[met]) > 0
 

@@ -15,7 +15,7 @@ from pipeline.gap.naming.workflow import GapDiagnosis, diagnose
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("sensor", "kind", "most", "operations", "largest"),
-    [("tls", "vertical_index", 25, 5000, 800), ("stereo", "focal_length", 18, 9000, 2400)],
+    [("tls", "vertical_index", 25, 5000, 800), ("stereo", "focal_length", 18, 9500, 2400)],
 )
 def test_a_diagnosis_compiles_few_small_kernels(
     sensor: str, kind: str, most: int, operations: int, largest: int, tmp_path: Path

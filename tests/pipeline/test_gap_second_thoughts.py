@@ -218,7 +218,7 @@ def test_a_low_pass_that_others_feign_takes_no_outlines_along(monkeypatch: pytes
         return SimpleNamespace(named=["noise"], edge_effect_names={each.name for each in state})
 
     monkeypatch.setattr(SelectionPass, "of", classmethod(named))
-    starts: Any = SimpleNamespace(edge_effects=list, edge_effects_given=lambda _: seen, with_these=lambda effects: effects)
+    starts: Any = SimpleNamespace(edge_effects=[], edge_effects_given=lambda _: seen, with_these=lambda effects: effects)
     assert select_beside_edge_effects(starts, KeyedRandom(1), frozenset()).edge_effect_names == {"edge_fattening"}
 
 

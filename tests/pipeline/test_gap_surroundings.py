@@ -9,7 +9,8 @@ from benchmarks.gap_closed_form.cases import Case, make
 from pipeline.formats.measurements.measurement import StereoMeasurement, read_measurement
 from pipeline.formats.measurements.surroundings import Surroundings
 from pipeline.gap.residuals.stereo_residuals import stereo_residuals, with_surroundings
-from scene.ray_casting.raycast import RayCaster
+from scene.common.backend import dr, mi
+from scene.ray_casting.raycast import Hits, RayCaster
 
 
 @pytest.fixture(scope="module")
@@ -24,13 +25,13 @@ def measurement(tmp_path_factory: pytest.TempPathFactory) -> StereoMeasurement:
 def _casts(monkeypatch: pytest.MonkeyPatch) -> list[int]:
     """Collect the rays of each cast from here on."""
     counts: list[int] = []
-    cast = RayCaster.cast
+    intersect = RayCaster.intersect
 
-    def counted(self: RayCaster, origins: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        counts.append(len(directions))
-        return cast(self, origins, directions)
+    def counted(self: RayCaster, origin: mi.Array3f64, direction: mi.Array3f64, **options: bool) -> Hits:
+        counts.append(dr.width(direction))
+        return intersect(self, origin, direction, **options)
 
-    monkeypatch.setattr(RayCaster, "cast", counted)
+    monkeypatch.setattr(RayCaster, "intersect", counted)
     return counts
 
 

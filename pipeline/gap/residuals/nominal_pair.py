@@ -142,7 +142,9 @@ class NominalPair:
         origin, ray = vector(left.position), _ray(left, *pixel)
         hits = scene.intersect(origin, ray, coherent=True)
         point = origin + dr.select(hits.valid, hits.distance, dr.nan) * ray
-        return _on_host(self.left_column(*pixel) - self.right_column(*_pixel(right, point)))[0]
+        seen = _pixel(right, point)
+        dr.eval(*seen)  # the next kernel is that of `disparity`, and need not be compiled again
+        return _on_host(self.left_column(*pixel) - self.right_column(*seen))[0]
 
     def left_column(self, u: mi.Float64, v: mi.Float64) -> mi.Float64:
         """Transform pixels of the left image to the rectified image, and return their columns, px: one half of a disparity.
