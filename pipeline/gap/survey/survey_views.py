@@ -6,9 +6,10 @@ is kept with it. Further stations, a second face and further pairs are added in 
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import ClassVar, Self
+from typing import Any, ClassVar, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -128,55 +129,74 @@ class StereoView(SurveyView):
 
 
 @dataclass(frozen=True)
-class TlsSurvey:
-    """A survey of one wall by laser scans, from which surveys with additional scans can be made.
+class Survey(ABC):
+    """A survey of one wall by one sensor, from which surveys with additional views can be made.
 
     Attributes
     ----------
-    views : What each scanner station sees.
+    views : What each scanner station or stereo pair sees.
     centre : (3,) centre of the wall, wall frame, m.
-    observe : Function that simulates the view of a further station. Its arguments are a measurement with the pose of that
-        station, and the number to give to this pose.
-    sensor, place : "tls", and what a place of observation is called in texts.
+    observe : Function that simulates a further view. Its arguments are a measurement with the pose of the station or the cameras
+        of the pair, and the number to give to this pose.
+    sensor, place : "tls" or "stereo", and what a place of observation is called in texts.
     """
 
-    views: tuple[TlsView, ...]
+    views: tuple[TlsView | StereoView, ...]
     centre: FloatArray
-    observe: Callable[[TlsMeasurement, int], TlsView]
-    sensor: ClassVar[SensorName] = "tls"
-    place: ClassVar[str] = "station"
+    observe: Callable[[Any, int], TlsView | StereoView]
+    sensor: ClassVar[SensorName]
+    place: ClassVar[str]
 
-    def moved(self, scale: float, turn_rad: float, number: int) -> TlsView:
-        """Simulate what the first scanner station would see from another place, to find out what a further scan adds.
+    @abstractmethod
+    def moved(self, scale: float, turn_rad: float, number: int) -> TlsView | StereoView:
+        """Simulate what the first station or pair would see from another place, to find out what a further view adds.
 
         Parameters
         ----------
         scale : New distance from the wall's centre, relative to the present one.
-        turn_rad : Rotation of the station about the vertical through the wall's centre, rad.
-        number : Number of the new pose, which tells it from those of the other stations.
+        turn_rad : Rotation of the sensor about the vertical through the wall's centre, rad.
+        number : Number of the new pose, which tells it from those of the other views.
 
         Raises
         ------
         InputError
             If too little of the wall is seen from there.
         """
+
+    @abstractmethod
+    def repeated(self, number: int) -> tuple[str, TlsView | StereoView]:
+        """Repeat the first view with the sensor turned over, to find out what this adds to the survey.
+
+        Parameters
+        ----------
+        number : Number of the new pose, if it is a new one.
+
+        Returns
+        -------
+        A description in words, and the view.
+        """
+
+
+@dataclass(frozen=True)
+class TlsSurvey(Survey):
+    """A survey of one wall by laser scans, from which surveys with additional scans can be made."""
+
+    views: tuple[TlsView, ...]
+    observe: Callable[[TlsMeasurement, int], TlsView]
+    sensor = "tls"
+    place = "station"
+
+    def moved(self, scale: float, turn_rad: float, number: int) -> TlsView:
+        """Simulate what the first scanner station would see from another place (see `Survey.moved`)."""
         base = self.views[0].measurement
         turn = _about_vertical(base, turn_rad)
         position = self.centre + scale * turn @ (base.station[0] - self.centre)
         return self.observe(base.changed(station=(position, turn @ base.station[1])), number)
 
     def repeated(self, number: int) -> tuple[str, TlsView]:
-        """Repeat the first station's scan in the other face of the instrument, to find out what this adds to the survey.
+        """Repeat the first station's scan in the other face of the instrument, with the same pose.
 
         In the second face, azimuths are larger by pi and zenith angles z become 2 pi - z.
-
-        Parameters
-        ----------
-        number : Not used: both faces share the pose of the first view.
-
-        Returns
-        -------
-        A description in words, and the view.
         """
         first = self.views[0]
         g = first.residuals.geometry
@@ -185,38 +205,16 @@ class TlsSurvey:
 
 
 @dataclass(frozen=True)
-class StereoSurvey:
-    """A survey of one wall by stereo pairs, from which surveys with additional pairs can be made.
-
-    Attributes
-    ----------
-    views : What each pair sees.
-    centre : (3,) centre of the wall, wall frame, m.
-    observe : Function that simulates the view of a further pair. Its arguments are a measurement with the cameras of that pair,
-        and the number to give to its pose.
-    sensor, place : "stereo", and what a place of observation is called in texts.
-    """
+class StereoSurvey(Survey):
+    """A survey of one wall by stereo pairs, from which surveys with additional pairs can be made."""
 
     views: tuple[StereoView, ...]
-    centre: FloatArray
     observe: Callable[[StereoMeasurement, int], StereoView]
-    sensor: ClassVar[SensorName] = "stereo"
-    place: ClassVar[str] = "pair of exposures"
+    sensor = "stereo"
+    place = "pair of exposures"
 
     def moved(self, scale: float, turn_rad: float, number: int) -> StereoView:
-        """Simulate what the first stereo pair would see from another place, to find out what a further pair adds.
-
-        Parameters
-        ----------
-        scale : New distance from the wall's centre, relative to the present one.
-        turn_rad : Rotation of the pair about the vertical through the wall's centre, rad.
-        number : Number of the new pose, which tells it from those of the other pairs.
-
-        Raises
-        ------
-        InputError
-            If too little of the wall is seen from there.
-        """
+        """Simulate what the first stereo pair would see from another place (see `Survey.moved`)."""
         base = self.views[0].measurement
         turn = _about_vertical(base, turn_rad)
         world, middle = base.frame.rotation.T @ turn @ base.frame.rotation, base.frame.to_world(self.centre[None])[0]
@@ -229,26 +227,12 @@ class StereoSurvey:
         return self.observe(base.changed(cameras=pair), number)
 
     def repeated(self, number: int) -> tuple[str, StereoView]:
-        """Simulate the first stereo pair once more with its cameras rolled, to find out what this adds to the survey.
-
-        The cameras are rolled by 45 degrees in opposite directions.
-
-        Parameters
-        ----------
-        number : Number of the new pose, which tells it from those of the other pairs.
-
-        Returns
-        -------
-        A description in words, and the view.
-        """
+        """Simulate the first stereo pair once more, with its cameras rolled by 45 degrees in opposite directions."""
         base = self.views[0].measurement
         pair = base.cameras.rotated("left", 2, np.pi / 4).rotated("right", 2, -np.pi / 4)
         return "the pair repeated with its cameras rolled by 45 degrees in opposite directions", self.observe(
             base.changed(cameras=pair), number
         )
-
-
-Survey = TlsSurvey | StereoSurvey
 
 
 def planned_survey(config: SimulationConfig, sensor: SensorName) -> Survey:
