@@ -21,7 +21,7 @@ from sensors.effects.smoothing import LowPass, Smoothing
 
 MOST_CELLS, _AT_ONCE = 40_000_000, 2_000_000
 """Most cells of a raster (as many as the largest cameras have pixels), and how many of them are traced at once."""
-_SEARCHED, _BANDS, _LEAST_ROWS = 200_000, 4, 64
+_SEARCHED, _BANDS, _LEAST_ROWS = 400_000, 4, 64
 """Most cells among which edge effects are searched; a larger raster is searched in this many bands of at least so many rows."""
 _MARGIN = 32
 """Cells beyond the outermost points: three standard deviations of the widest low-pass filter that is searched for."""
@@ -108,7 +108,7 @@ class DisparityRaster:
 
         Returns
         -------
-        raster : The whole raster if it has at most 200,000 cells, else four bands of its rows. Empty rows between the bands
+        raster : The whole raster if it has at most 400,000 cells, else four bands of its rows. Empty rows between the bands
             keep them from affecting each other. In rows without points `hidden` is not valid.
         points : (k,) row numbers of those of the n measured points that lie in it.
         """
