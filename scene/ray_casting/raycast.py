@@ -250,7 +250,7 @@ class RayCaster:
         """
         return label_of_nearest_vertex(self._vertices, self._face_vertices, hits.face, hits.valid, point, labels)
 
-    def cast(self, origins: FloatArray, directions: FloatArray, *, coherent: bool = False) -> tuple[FloatArray, IntArray]:
+    def cast(self, origins: FloatArray, directions: FloatArray) -> tuple[FloatArray, IntArray]:
         """Cast n rays given as NumPy arrays and return where they hit the mesh first.
 
         Parameters
@@ -259,8 +259,6 @@ class RayCaster:
             Starts of the rays, or the common start of all, m.
         directions : (n, 3) array
             Directions of the rays.
-        coherent : bool
-            Whether neighbouring rays are nearly parallel, which the ray tracer exploits.
 
         Returns
         -------
@@ -268,7 +266,7 @@ class RayCaster:
             Distances in lengths of the direction vectors, and face numbers; NaN and -1 for a miss.
         """
         origin = mi.Array3f64(*(dr.opaque(mi.Float64, x) for x in origins)) if origins.ndim == 1 else vectors_on_device(origins)
-        hits = self.intersect(origin, vectors_on_device(directions), coherent=coherent)
+        hits = self.intersect(origin, vectors_on_device(directions), coherent=False)
         distance = dr.select(hits.valid, hits.distance, np.nan)
         face = dr.select(hits.valid, mi.Int32(hits.face), -1)
         dr.eval(distance, face)
@@ -282,7 +280,7 @@ class RayCaster:
         """
         vertices = self.mesh.vertices[:: max(len(self.mesh.vertices) // _SIGHTS, 1)]
         sight = vertices - position
-        _, face = self.cast(position, sight, coherent=True)
+        _, face = self.cast(position, sight)
         met = face >= 0
         return face[met], np.einsum("ij,ij->i", self.mesh.face_normals(face[met]), sight[met]) > 0
 

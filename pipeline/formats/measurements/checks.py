@@ -85,7 +85,7 @@ class PointFit:
         away, length = away[length > _ONE_PLACE_M], length[length > _ONE_PLACE_M]
         if not len(length):
             return cls(0.0, 0.0, np.nan, reach)
-        distance = reference.cast(origin, away / length[:, None], coherent=True)[0]
+        distance = reference.cast(origin, away / length[:, None])[0]
         hit = np.isfinite(distance)
         off = (length - distance)[hit]
         near = np.abs(off) <= np.maximum(_NEAR_M, reach * length[hit])

@@ -84,7 +84,7 @@ class DisparityRaster:
         for part in np.array_split(np.arange(len(rows)), -(-disparity.size // _AT_ONCE)):
             u, v = (x.ravel() for x in np.meshgrid(columns, rows[part]))
             ray = pixel_rays(left, u, v)
-            point = left.position + measurement.scene.cast(left.position, ray, coherent=True)[0][:, None] * ray
+            point = left.position + measurement.scene.cast(left.position, ray)[0][:, None] * ray
             seen, hidden = np.isfinite(point).all(axis=1), is_hidden(measurement.scene, right.position, point)
             matched = seen & ~hidden & _in_image(right, point)
             found = np.full(len(u), np.nan)

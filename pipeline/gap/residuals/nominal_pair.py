@@ -303,7 +303,7 @@ def is_hidden(scene: RayCaster, position: FloatArray, points: FloatArray) -> Boo
     """
     back = np.nan_to_num(points, nan=1e9) - position
     length = np.linalg.norm(back, axis=1)
-    return np.asarray(scene.cast(position, back / length[:, None], coherent=True)[0] < length * (1 - _HIDDEN_SHARE))
+    return np.asarray(scene.cast(position, back / length[:, None])[0] < length * (1 - _HIDDEN_SHARE))
 
 
 def predict_disparities(nominal: NominalPair, real: Iterable[CameraPair], geometry: PixelGeometry) -> list[FloatArray]:

@@ -108,11 +108,11 @@ def cast_rays(measurement: TlsMeasurement, axes: list[FloatArray]) -> RayHits:
     The hits, in the order of the rays.
     """
     ray, scene, position = axes[0], measurement.scene, measurement.station[0]
-    distance, face = scene.cast(position, ray, coherent=True)
+    distance, face = scene.cast(position, ray)
     face = np.maximum(face, 0)
     normal = scene.mesh.normals[face]
     sides = _PROBE_RAD * np.stack([axes[1], -axes[1], axes[2], -axes[2]], axis=1)
-    beside = scene.cast(position, (ray[:, None] + sides).reshape(-1, 3), coherent=True)[0].reshape(-1, 4)
+    beside = scene.cast(position, (ray[:, None] + sides).reshape(-1, 3))[0].reshape(-1, 4)
     slopes = (range_derivative(normal, ray, axis, distance) for axis in axes[1:])
     flat = _PROBE_RAD * np.stack([sign * slope for slope in slopes for sign in (1, -1)], axis=1)
     bend = np.nan_to_num(np.abs(beside - distance[:, None] - flat), nan=np.inf)

@@ -212,7 +212,7 @@ def _reference(
     """What the pixels of the `real` cameras see: their geometry on the reference, and the depth (n,), m."""
     left, camera = real.left, real.right
     ray = pixel_rays(left, u, v)
-    distance, face = scene.cast(left.position, ray, coherent=True)
+    distance, face = scene.cast(left.position, ray)
     point = left.position + distance[:, None] * ray
     right, normal = project(camera, point), scene.mesh.normals[np.maximum(face, 0)]
     geometry = PixelGeometry(
