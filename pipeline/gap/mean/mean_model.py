@@ -338,8 +338,9 @@ class MeanModel:
         hold the same draws, as coordinates in the eigenvectors of that function (see `in_bases`).
         """
         draws = random.generator().standard_normal((len(self._total), count)) / np.sqrt(at.weight)[:, None]
-        vectors = self._bases[at.basis][1]
-        return [draws if index == at.basis else other.T @ (vectors @ draws) for index, (_, other) in enumerate(self._bases)]
+        means = self._bases[at.basis][1] @ draws
+        others = map_in_threads(lambda basis: basis[1].T @ means, self._bases)
+        return [draws if index == at.basis else found for index, found in enumerate(others)]
 
 
 def column_chunks(count: int) -> list[slice]:
