@@ -109,8 +109,10 @@ _CAUSES = {
         "it is found with its width, but dropped: a few points beside edges lie farther off with it, and outweigh the others on "
         "the validation blocks"
     ),
-    "`matcher`": "whether edge fattening is named before the injection depends on single points: with one of 8,269 usable points "
-    "more it was not, and then all six cases counted as wrong",
+    "`matcher`": (
+        "whether edge fattening is named before the injection depends on single points: with one usable point more (8,269 in "
+        "place of 8,268) it was not named, and then all six cases counted as wrong"
+    ),
 }
 """Where cases fail, and why."""
 

@@ -26,7 +26,9 @@ def tab() -> Iterator[Any]:
     loop would disturb those of other tests.
     """
     if CHROMIUM is None:
-        pytest.skip("there is no Chromium on this machine; `make setup-all` installs it where it may")
+        pytest.skip(
+            "there is no Chromium on this machine; `make setup-all` installs it if it has the right to install system packages"
+        )
     from playwright.sync_api import sync_playwright
 
     with sync_playwright() as playwright:

@@ -5,7 +5,8 @@ from __future__ import annotations
 import json
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from types import SimpleNamespace
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -239,6 +240,41 @@ def test_effects_are_tried_one_by_one_where_several_weak_ones_seem_needed(
     for fewer in (0, 1):
         found = select_and_refit(points, first)
         assert (found is tried[-1]) == (fewer > 0)
+
+
+def _explanation(physical: int, empirical: int) -> Any:
+    """Return an explanation with so many effects of the catalogue and empirical terms."""
+    kinds = [False] * physical + [True] * empirical
+    estimates = [SimpleNamespace(candidate=SimpleNamespace(empirical=each)) for each in kinds]
+    return SimpleNamespace(chosen=estimates, estimates=estimates, complexity=(empirical, len(kinds)))
+
+
+@pytest.mark.parametrize(
+    ("best", "other", "ties", "searched", "other_wins"),
+    [
+        ((2, 0), (1, 1), False, True, False),  # its empirical term might have gone
+        ((2, 0), (2, 0), False, False, False),
+        ((2, 0), (2, 0), True, True, True),
+        ((2, 0), (3, 0), True, False, False),
+        ((1, 1), (2, 0), False, True, True),
+        (None, (3, 1), False, True, True),
+    ],
+)
+def test_no_effects_are_searched_beside_an_explanation_that_cannot_be_simpler(
+    best: tuple[int, int] | None,
+    other: tuple[int, int],
+    ties: bool,
+    searched: bool,
+    other_wins: bool,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Explanations are given as their numbers of effects of the catalogue and of empirical terms."""
+    tried: list[Any] = []
+    monkeypatch.setattr(nonlinear_refit, "_search_beside", lambda _, outcome: tried.append(outcome))
+    monkeypatch.setattr(nonlinear_refit, "_within_bounds", lambda *_: True)
+    known, second, nothing = None if best is None else _explanation(*best), _explanation(*other), cast(Any, None)
+    assert nonlinear_refit._simpler(nothing, known, second, ties) is (second if other_wins else known)
+    assert tried == [second] * searched
 
 
 def test_the_effect_that_leaves_the_least_noise_ranks_first(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

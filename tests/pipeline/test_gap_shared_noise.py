@@ -13,7 +13,7 @@ from pipeline.gap.mean.mean_model import MeanModel
 from pipeline.gap.mean.nonparametric_terms import nonparametric_terms
 from pipeline.gap.mean.normal_equations import NoiseDraws
 from pipeline.gap.mean.search import MeanSearch
-from pipeline.gap.naming.validation_scores import _RegisteredResiduals
+from pipeline.gap.naming.validation_scores import _log_score_gains, _RegisteredResiduals
 from pipeline.gap.noise_and_edges.variance_model import NoiseRatio, standardised_deviations
 from pipeline.gap.residuals import wall_blocks
 from pipeline.gap.residuals.correlated_noise import GridCorrelatedNoise, NodeField
@@ -112,6 +112,22 @@ def test_the_score_on_held_out_blocks_is_the_density_of_all_points_together() ->
     ]
     expected = [multivariate_normal(np.zeros(count), together).logpdf(each) for each in (value, other)]
     assert scores[0] - scores[1] == pytest.approx(expected[0] - expected[1], rel=1e-6)
+
+
+def test_the_shared_noise_of_a_block_is_built_once_for_both_models(monkeypatch: pytest.MonkeyPatch) -> None:
+    """It is built twice only if the models differ in it. The gains are those of each block on its own."""
+    pixels, built = raster(20), []
+    block = (pixels[:, 0] > pixels[:, 0].mean()).astype(int)
+    value = np.random.default_rng(6).normal(0, SIGMA, len(pixels))
+    shared, less = (GridCorrelatedNoise((noise,), pixels) for noise in (NOISE, NOISE.model_copy(update={"sigma_px": 0.1})))
+    node_field = GridCorrelatedNoise.node_field
+    monkeypatch.setattr(GridCorrelatedNoise, "node_field", lambda self, count: built.append(count) or node_field(self, count))
+    for other, each in ((shared, 1), (less, 2)):
+        built.clear()
+        models = [_RegisteredResiduals(value, np.full(len(pixels), SIGMA), noise) for noise in (shared, other)]
+        gains = _log_score_gains(*models, np.ones(len(pixels), dtype=bool), pixels, block, 0.0)
+        assert len(built) == 2 * each
+        assert (gains == 0).all() == (other is shared)
 
 
 def noisy(seed: int, pixels: FloatArray, cholesky: FloatArray) -> StereoResiduals:

@@ -339,8 +339,9 @@ class MeanModel:
         """
         draws = random.generator().standard_normal((len(self._total), count)) / np.sqrt(at.weight)[:, None]
         means = self._bases[at.basis][1] @ draws
-        others = map_in_threads(lambda basis: basis[1].T @ means, self._bases)
-        return [draws if index == at.basis else found for index, found in enumerate(others)]
+        return map_in_threads(
+            lambda index: draws if index == at.basis else self._bases[index][1].T @ means, range(len(self._bases))
+        )
 
 
 def column_chunks(count: int) -> list[slice]:

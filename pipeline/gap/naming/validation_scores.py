@@ -216,11 +216,12 @@ def _log_score_gains(
     """
     chosen = np.flatnonzero(rows & (_inliers(with_all) | _inliers(without)))
     patch = wall_blocks_by_points(at[chosen], _POINTS_PER_PATCH)
+    noises = {each.effects: each for each in (with_all.shared, without.shared)}  # one if the effect is no grid-correlated noise
     found = []
     for number in np.unique(block[chosen]):
         inside = block[chosen] == number
         own_patch, own_rows = np.unique(patch[inside], return_inverse=True)[1], chosen[inside]
-        fields = {each.effects: each.part(own_rows).node_field(len(own_rows)) for each in (with_all.shared, without.shared)}
+        fields = {effects: noise.part(own_rows).node_field(len(own_rows)) for effects, noise in noises.items()}
         after, before = (each.log_score(own_rows, fields[each.shared.effects], own_patch, sigma) for each in (with_all, without))
         found.append(after - before)
     return np.array(found)

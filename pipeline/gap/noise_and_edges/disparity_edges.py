@@ -305,7 +305,11 @@ def _gather_trusted(measurement: Measurement, residuals: Residuals, trusted: NDA
 
 
 def _log_likelihood_with_edge_effects(data: _EdgeData | None, count: int) -> float:
-    """Log-likelihood of `count` trusted points at a pose, with the edge effects that are found there; `data`: at that pose."""
+    """Log-likelihood of the disparities at one pose, beside the edge effects that a search finds there.
+
+    data: the disparities at this pose; None: -inf. The sum over its points is scaled to `count` points, so that poses at which
+    other points are used can be compared.
+    """
     if data is None:
         return -np.inf
     density = data.registered_density([each.effect for each in _search(data)])

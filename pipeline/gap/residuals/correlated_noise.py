@@ -51,7 +51,7 @@ class NodeField:
 
     @cached_property
     def precision(self) -> FloatArray:
-        """(q, q) inverse covariance of the nodes' values, 1/px², for Woodbury's identity."""
+        """(q, q) inverse covariance of the nodes' values, 1/px²; Woodbury's identity inverts that of the points with it."""
         half = np.tril(dpotri(self.root, lower=True)[0])
         return np.asarray(half + np.tril(half, -1).T)
 

@@ -114,7 +114,10 @@ def move_onto_rays(left: Camera, points: FloatArray, u: FloatArray, v: FloatArra
 
 
 def _reprojection_errors(left: Camera, clouds: list[FloatArray], u: FloatArray, v: FloatArray) -> FloatArray:
-    """(k, 2 n) projected minus given pixels of the same points at k places, columns first, px."""
+    """(k, 2 n) reprojection errors of n points at k poses, px: the errors of their image columns, then those of their rows.
+
+    clouds: (n, 3) points at each pose. u, v: (n,) columns and rows at which they were matched, which are subtracted.
+    """
     projected = project(left, np.concatenate(clouds))
     columns, rows = (each.reshape(len(clouds), -1) for each in projected)
     return np.concatenate([columns - u, rows - v], axis=1)

@@ -165,11 +165,11 @@ class Survey(ABC):
 
     @abstractmethod
     def repeated(self, number: int) -> tuple[str, TlsView | StereoView]:
-        """Repeat the first view with the sensor turned over, to find out what this adds to the survey.
+        """Repeat the first view with the sensor set up in another way, to find out what this adds to the survey.
 
         Parameters
         ----------
-        number : Number of the new pose, if it is a new one.
+        number : Number of the new pose. A laser scanner does not need it, because it keeps its pose.
 
         Returns
         -------
@@ -187,14 +187,14 @@ class TlsSurvey(Survey):
     place = "station"
 
     def moved(self, scale: float, turn_rad: float, number: int) -> TlsView:
-        """Simulate what the first scanner station would see from another place (see `Survey.moved`)."""
+        """Simulate a scan from another place (see `Survey.moved`)."""
         base = self.views[0].measurement
         turn = _about_vertical(base, turn_rad)
         position = self.centre + scale * turn @ (base.station[0] - self.centre)
         return self.observe(base.changed(station=(position, turn @ base.station[1])), number)
 
     def repeated(self, number: int) -> tuple[str, TlsView]:
-        """Repeat the first station's scan in the other face of the instrument, with the same pose.
+        """Repeat the first station's scan from the same pose in the second face of the instrument (see `Survey.repeated`).
 
         In the second face, azimuths are larger by pi and zenith angles z become 2 pi - z.
         """
@@ -214,7 +214,7 @@ class StereoSurvey(Survey):
     place = "pair of exposures"
 
     def moved(self, scale: float, turn_rad: float, number: int) -> StereoView:
-        """Simulate what the first stereo pair would see from another place (see `Survey.moved`)."""
+        """Simulate exposures of the first pair from another place (see `Survey.moved`)."""
         base = self.views[0].measurement
         turn = _about_vertical(base, turn_rad)
         world, middle = base.frame.rotation.T @ turn @ base.frame.rotation, base.frame.to_world(self.centre[None])[0]
@@ -227,7 +227,7 @@ class StereoSurvey(Survey):
         return self.observe(base.changed(cameras=pair), number)
 
     def repeated(self, number: int) -> tuple[str, StereoView]:
-        """Simulate the first stereo pair once more, with its cameras rolled by 45 degrees in opposite directions."""
+        """Simulate the first stereo pair with its cameras rolled by 45 degrees in opposite directions (see `Survey.repeated`)."""
         base = self.views[0].measurement
         pair = base.cameras.rotated("left", 2, np.pi / 4).rotated("right", 2, -np.pi / 4)
         return "the pair repeated with its cameras rolled by 45 degrees in opposite directions", self.observe(
