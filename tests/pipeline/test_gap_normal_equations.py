@@ -12,6 +12,7 @@ from pipeline.gap.mean.candidates import Candidate, SineGrid
 from pipeline.gap.mean.design import Design
 from pipeline.gap.mean.mean_model import MeanFit, MeanModel, _NormalEquations
 from pipeline.gap.mean.nonparametric_terms import nonparametric_terms
+from pipeline.gap.mean.projected_columns import WithinProducts
 from pipeline.gap.mean.search import MeanSearch
 from pipeline.gap.residuals import wall_blocks
 from pipeline.gap.residuals.alignment import fit_pose
@@ -106,9 +107,10 @@ def test_covariances_that_are_kept_are_those_that_were_likely(design: Design) ->
     whole = MeanModel(design.cells, at, design.residuals.sigma, design.residuals.correlated_noise)
     rows, root = whole.rows, whole.inverse_sigma[:, None]
     of_all = [whole.project(part[rows] * root) for part in (design.residuals.pose_jacobian, wrong[:, None])]
-    highest = max(_NormalEquations.of(*of_all).log_likelihood(each) for each in whole.covariances)
-    model, covariances, kept = whole.restrict([of_all[0]], of_all[1])
+    products = WithinProducts.of(*of_all)
+    highest = max(_NormalEquations(*of_all, products).log_likelihood(each) for each in whole.covariances)
+    model, covariances, kept = whole.restrict(*of_all, products, of_all[0].within.shape[1])
     assert 0 not in kept
-    normal = _NormalEquations.of(*(each.in_bases(kept) for each in of_all))
+    normal = _NormalEquations(*(each.in_bases(kept) for each in of_all), products)
     assert max(normal.log_likelihood(each) for each in covariances) == pytest.approx(highest, abs=1e-6)
     assert max(normal.log_likelihood(each) for each in model.covariances) == pytest.approx(highest, abs=1e-6)

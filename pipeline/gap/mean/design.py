@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from pipeline.gap.mean.candidates import Candidate, SineGrid, prior_precision, with_period
 from pipeline.gap.mean.mean_model import CellCovariance, MeanFit, MeanModel, column_chunks, fit_reml
 from pipeline.gap.mean.normal_equations import NoiseDraws, NormalEquations, SineProducts, assemble, extend, sine_products
-from pipeline.gap.mean.projected_columns import ProjectedColumns
+from pipeline.gap.mean.projected_columns import ProjectedColumns, WithinProducts
 from pipeline.gap.residuals.residuals import Residuals
 from pipeline.gap.residuals.wall_blocks import WallCells
 from pipeline.gap.thresholds import thresholds
@@ -159,7 +159,8 @@ class Design:
         fixed = model.project(_columns(model, pose, chosen.plain, place))
         value = model.project(residuals.value[rows, None] * root)
         most_sigma = thresholds().mean.most_reference_error / float(np.median(residuals.unit_m))
-        model, covariances, bases = model.restrict([fixed.select(list(range(count))), fixed], value, most_sigma)
+        within = WithinProducts.of(fixed, value)
+        model, covariances, bases = model.restrict(fixed, value, within, count, most_sigma)
         fixed, value = fixed.in_bases(bases), value.in_bases(bases)
         noise = NoiseDraws.of(model, NULL_DRAWS, _NULL_ROWS, random.child("within"))
         grids = [grid.part(rows) for grid in chosen.grids]
@@ -168,7 +169,7 @@ class Design:
         )  # few non-parametric ones are held
         waves = SineProducts.of(model, grids, fixed.within_weighted[:, :held_count], value, noise)
         known = [np.zeros(count), *(prior_precision(each, each.columns.shape[1]) for each in chosen.plain)]
-        equations = assemble(covariances, fixed, value, waves).with_precision(np.concatenate(known))
+        equations = assemble(covariances, fixed, value, within, waves).with_precision(np.concatenate(known))
         drawn = noise.products(fixed.within[noise.rows], model.within_noise.to_nodes(fixed.within))
         found = cls(
             residuals, chosen, cells, model, pose, turn, precision, grids, value, fixed, None, place, waves, drawn, equations

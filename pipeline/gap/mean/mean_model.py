@@ -22,13 +22,12 @@ from itertools import product
 
 import numpy as np
 from scipy import sparse
-from scipy.linalg import cholesky, eigh, solve_triangular
-from scipy.linalg.lapack import dsysv
+from scipy.linalg import cholesky
 from scipy.spatial.distance import pdist, squareform
 from scipy.special import j0
 
-from pipeline.gap.mean.projected_columns import ProjectedColumns
-from pipeline.gap.mean.within_cell_noise import WithinCellNoise
+from pipeline.gap.mean.projected_columns import ProjectedColumns, WithinProducts
+from pipeline.gap.mean.within_cell_noise import WithinCellNoise, invert_triangle
 from pipeline.gap.residuals.correlated_noise import NO_CORRELATED_NOISE, GridCorrelatedNoise
 from pipeline.gap.residuals.wall_blocks import WallCells
 from scene.common.keyed_random import KeyedRandom
@@ -139,7 +138,7 @@ class MeanModel:
         self._across = sparse.csr_array(self._planes.T)
         self.within_noise = WithinCellNoise.of(field, self.inverse_sigma, self._planes[: len(cells)])
         variance = self.within_noise.mean_covariance()
-        self._root = cholesky(variance, lower=True)
+        self._unroot = invert_triangle(cholesky(variance, lower=True))
         self.typical_sigma = typical = float(np.median(np.sqrt(np.diag(variance) / self._total)))
         scale = typical * np.sqrt(self._total)
         distance = pdist(cells.centre / cells.side_m)
@@ -148,7 +147,7 @@ class MeanModel:
             found = squareform(correlation(distance))
             np.fill_diagonal(found, 1.0)
             half = self._whitened(found * np.outer(scale, scale))
-            values, vectors = eigh(self._whitened(half.T), driver="evd", overwrite_a=True)
+            values, vectors = np.linalg.eigh(self._whitened(half.T))  # SciPy's would hold up the other threads
             return np.maximum(values, 0.0), vectors
 
         short = [each for length, each in _CORRELATIONS if length <= _LONGEST * np.sqrt(len(cells))]
@@ -169,17 +168,24 @@ class MeanModel:
         return CellCovariance(length, ratio, 1 / (1 + ratio * self._bases[length][0])) if ratio else self._white
 
     def restrict(
-        self, designs: list[ProjectedColumns], value: ProjectedColumns, most_sigma: float = np.inf
+        self,
+        columns: ProjectedColumns,
+        value: ProjectedColumns,
+        within: WithinProducts,
+        fewest: int,
+        most_sigma: float = np.inf,
     ) -> tuple[MeanModel, list[CellCovariance], list[int]]:
         """Drop trial covariances of the reference surface's error under which the residuals are unlikely, to save time later.
 
         A trial covariance has a correlation function and an amplitude. A function is kept if the residuals are likely under it
-        with at least one of the given sets of columns fitted. Of its amplitudes, only those near the most likely ones are kept.
+        with the smallest or with the largest model fitted. Of its amplitudes, only those near the most likely ones are kept.
 
         Parameters
         ----------
-        designs : Sets of design columns to fit: the smallest model (the pose) and the largest one (all candidates).
+        columns : Design columns of the largest model: the pose and all candidates.
         value : The residuals, as one column.
+        within : Products of these columns and residuals within cells.
+        fewest : Number of leading columns that are the smallest model: the pose.
         most_sigma : Largest standard deviation of the reference's error, in the unit of the observable (m, or px of
             disparity).
 
@@ -190,13 +196,14 @@ class MeanModel:
         kept : Indices of the kept correlation functions among all; `ProjectedColumns.in_bases` reduces columns to them.
         """
         ratios = [ratio for ratio in self._ratios if ratio <= (most_sigma / self.typical_sigma) ** 2]
-        normals = [_NormalEquations.of(design, value) for design in designs]
+        smallest = _NormalEquations(columns.select(list(range(fewest))), value, within.first(fewest))
+        normals = [smallest, _NormalEquations(columns, value, within)]
 
         def highest(which: tuple[_NormalEquations, int]) -> tuple[int, float]:
             normal, basis = which
             return _maximum([partial(normal.log_likelihood, self._covariance(basis, ratio)) for ratio in ratios])
 
-        shape = len(designs), len(self._bases)
+        shape = len(normals), len(self._bases)
         found = map_in_threads(highest, product(normals, range(len(self._bases))))
         tops, heights = (np.reshape(part, shape) for part in zip(*found, strict=True))
         kept = [int(basis) for basis in np.flatnonzero((heights > heights.max(axis=1, keepdims=True) - _WORSE).any(axis=0))]
@@ -288,11 +295,11 @@ class MeanModel:
         One (m, k) array for each trial correlation function of the reference's error.
         """
         white = self._whitened(means)
-        return [vectors.T @ white for _, vectors in self._bases]
+        return map_in_threads(lambda basis: np.asarray(basis[1].T @ white), self._bases)
 
     def _whitened(self, means: FloatArray) -> FloatArray:
         """Cell means (m, k) transformed so that their noise is independent with variance 1."""
-        return means if self.within_noise.is_white else np.asarray(solve_triangular(self._root, means, lower=True))
+        return means if self.within_noise.is_white else np.asarray(self._unroot @ means)
 
     def project(self, weighted: FloatArray) -> ProjectedColumns:
         """Divide design columns into cell means and deviations within cells, in the form that all fits use.
@@ -385,39 +392,27 @@ class _NormalEquations:
 
     Attributes
     ----------
-    columns, value : Design columns and residuals.
-    gram : (k, k) products of the columns within cells.
-    right : (k,) products of columns and residuals within cells.
-    square : Sum of squared residuals within cells.
+    columns, value : k design columns, and residuals as one column.
+    within : Their products within cells.
     """
 
     columns: ProjectedColumns
     value: ProjectedColumns
-    gram: FloatArray
-    right: FloatArray
-    square: float
-
-    @classmethod
-    def of(cls, columns: ProjectedColumns, value: ProjectedColumns) -> _NormalEquations:
-        """Compute the products within cells."""
-        y = value.within_weighted[:, 0]
-        return cls(
-            columns, value, columns.within.T @ columns.within_weighted, columns.within.T @ y, float(value.within[:, 0] @ y)
-        )
+    within: WithinProducts
 
     def log_likelihood(self, at: CellCovariance) -> float:
         """Log-likelihood of the fit of all columns."""
         matrix, right, constant = self.equations(at)
         scale = _scale(matrix)
-        found = dsysv(_regularised(matrix, scale), scale * right)[2]
+        found = np.linalg.solve(_regularised(matrix, scale), scale * right)
         return constant + 0.5 * float(right @ (scale * found))
 
     def equations(self, at: CellCovariance) -> tuple[FloatArray, FloatArray, float]:
         """Matrix (k, k), right side (k,), and the log-likelihood without any column."""
         root = np.sqrt(at.weight)
         basis, y = self.columns.between[at.basis] * root[:, None], self.value.between[at.basis][:, 0] * root
-        constant = 0.5 * (np.log(at.weight).sum() - y @ y - self.square)
-        return self.gram + basis.T @ basis, self.right + basis.T @ y, float(constant)
+        constant = 0.5 * (np.log(at.weight).sum() - y @ y - self.within.square[0])
+        return self.within.gram + basis.T @ basis, self.within.right[:, 0] + basis.T @ y, float(constant)
 
 
 def fit_reml(
@@ -441,7 +436,7 @@ def fit_reml(
     weighted by their likelihood. It includes how much the estimates differ between them, because the true covariance is not
     known.
     """
-    normal = _NormalEquations.of(columns, value)
+    normal = _NormalEquations(columns, value, WithinProducts.of(columns, value))
     matrices, rights, constants = map(np.stack, zip(*map(normal.equations, covariances), strict=True))
     if precision is not None:
         matrices = matrices + precision

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from pipeline.gap.mean.candidates import SineGrid
 from pipeline.gap.mean.mean_model import CellCovariance, MeanModel
-from pipeline.gap.mean.projected_columns import ProjectedColumns
+from pipeline.gap.mean.projected_columns import ProjectedColumns, WithinProducts
 from scene.common.keyed_random import KeyedRandom
 from scene.common.threads import map_in_threads
 from scene.geometry.mesh import FloatArray
@@ -408,7 +408,9 @@ def _explained(rest: FloatArray, own: FloatArray, left: FloatArray) -> FloatArra
     return np.asarray(0.5 * np.einsum("cfk,cfkv->cfv", share, turned**2))
 
 
-def assemble(at: list[CellCovariance], fixed: ProjectedColumns, value: ProjectedColumns, waves: SineProducts) -> NormalEquations:
+def assemble(
+    at: list[CellCovariance], fixed: ProjectedColumns, value: ProjectedColumns, within: WithinProducts, waves: SineProducts
+) -> NormalEquations:
     """Build the normal equations of pose and candidate errors under each of C trial covariances.
 
     From them, any set of candidates is scored without returning to the points.
@@ -418,20 +420,19 @@ def assemble(at: list[CellCovariance], fixed: ProjectedColumns, value: Projected
     at : The C trial covariances of the mean residuals in the cells of the wall.
     fixed : The k design columns of the pose and of all candidates but the sines of unknown period.
     value : v columns of residuals: one of measured residuals, or several of simulated ones.
+    within : Products of these columns and residuals within cells.
     waves : Inner products of the columns of w trial sines with the other columns and the residuals.
 
     Returns
     -------
     The equations. Their list `held_columns`, the columns beside which sines can be scored, is still empty.
     """
-    gram, right = fixed.within.T @ fixed.within_weighted, fixed.within.T @ value.within_weighted
-    square = np.einsum("nv,nv->v", value.within, value.within_weighted)
 
     def at_one(each: CellCovariance) -> tuple[FloatArray, ...]:
         root = np.sqrt(each.weight)[:, None]
         basis, y = fixed.between[each.basis] * root, value.between[each.basis] * root
-        constant = 0.5 * (np.log(each.weight).sum() - np.sum(y**2, axis=0) - square)
-        return gram + basis.T @ basis, right + basis.T @ y, constant
+        constant = 0.5 * (np.log(each.weight).sum() - np.sum(y**2, axis=0) - within.square)
+        return within.gram + basis.T @ basis, within.right + basis.T @ y, constant
 
     products, sides, constant = (np.stack(part) for part in zip(*map_in_threads(at_one, at), strict=True))
     nothing = np.empty((len(at), len(waves.right), 0))

@@ -67,3 +67,31 @@ class ProjectedColumns:
     def append(self, other: ProjectedColumns) -> ProjectedColumns:
         """Return these design columns followed by those of `other`, another set of columns at the same n points."""
         return ProjectedColumns.concatenate([self, other])
+
+
+@dataclass(frozen=True)
+class WithinProducts:
+    """Inner products of k design columns with each other and with v columns of residuals, of their parts within cells.
+
+    They are what normal equations under all covariances of the reference surface's error have in common.
+
+    Attributes
+    ----------
+    gram : (k, k) products of the design columns with each other.
+    right : (k, v) products of the design columns with the residuals.
+    square : (v,) products of each column of residuals with itself.
+    """
+
+    gram: FloatArray
+    right: FloatArray
+    square: FloatArray
+
+    @classmethod
+    def of(cls, columns: ProjectedColumns, value: ProjectedColumns) -> WithinProducts:
+        """Compute the products of design columns and residuals at the same n points."""
+        y = value.within_weighted
+        return cls(columns.within.T @ columns.within_weighted, columns.within.T @ y, np.einsum("nv,nv->v", value.within, y))
+
+    def first(self, count: int) -> WithinProducts:
+        """Return the products of the first design columns alone, such as those of the pose. count: how many."""
+        return WithinProducts(self.gram[:count, :count], self.right[:count], self.square)

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from pipeline.change.robust import nmad
 from pipeline.formats.measurements.measurement import Measurement, StereoMeasurement
 from pipeline.gap.noise_and_edges.edge_effects import EdgeEffect, WallBlocks, log_density, maximise_gain
-from pipeline.gap.residuals.alignment import AlignedMeasurement, align, compute_residuals, fit_pose_robustly
+from pipeline.gap.residuals.alignment import AlignedMeasurement, RobustPoseFit, align, compute_residuals, fit_pose_robustly
 from pipeline.gap.residuals.disparity_raster import DisparityRaster
 from pipeline.gap.residuals.residuals import BoolArray, Residuals
 from pipeline.gap.residuals.stereo_residuals import StereoResiduals, with_surroundings
@@ -127,6 +127,11 @@ class _EdgeData:
         """(n,) log density of the residuals with the known effects alone."""
         return log_density(self.registered_residuals, self.shift_without, self.sigma)
 
+    @cached_property
+    def _pose_fit(self) -> RobustPoseFit:
+        """Fits of the pose beside an effect."""
+        return RobustPoseFit.of(self.residuals)
+
     def shift(self, effects: list[Effect]) -> FloatArray:
         """(n,) change of the disparities by the known effects and further ones, px."""
         return self.raster.added_by([*self.beside, *effects], self.disparity)
@@ -142,7 +147,7 @@ class _EdgeData:
     def registered_density(self, effects: list[Effect]) -> FloatArray:
         """(n,) log density with further effects, and with the pose and the noise that are fitted beside them; 0 if held out."""
         shift = self.shift(effects)
-        value, _, scale = fit_pose_robustly(replace(self.residuals, value=self.residuals.value - shift))
+        value, _, scale = self._pose_fit.fit(self.residuals.value - shift)
         return np.where(self.held_out, 0.0, log_density(value + shift, shift, scale * self.residuals.sigma))
 
     @cached_property
@@ -182,7 +187,7 @@ class _EdgeData:
     def registered_with(self, effect: Effect) -> _EdgeData:
         """Repeat the registration and the noise estimate with an effect beside the known ones."""
         shift = np.nan_to_num(self.shift([effect]))
-        value, _, scale = fit_pose_robustly(replace(self.residuals, value=self.residuals.value - shift))
+        value, _, scale = self._pose_fit.fit(self.residuals.value - shift)
         return replace(self, registered_residuals=value + shift, sigma=scale * self.residuals.sigma)
 
     def likelier(self, found: list[EdgeEffect]) -> EdgeEffect:

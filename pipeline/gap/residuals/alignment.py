@@ -6,7 +6,7 @@ The surveyed pose is never exact, so the pose is a nuisance parameter of every f
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -56,19 +56,69 @@ def fit_pose_robustly(residuals: Residuals) -> tuple[FloatArray, FloatArray, flo
     noise_ratio : Robust standard deviation (NMAD) of `value` divided by its predicted standard deviation; at least 1. It is
         above 1 if the residuals scatter more than predicted.
     """
-    kept, scale = residuals.usable.copy(), 1.0
-    value, pose, design = residuals.value, np.zeros(residuals.pose_jacobian.shape[1]), _weighted_design(residuals)
-    for _ in range(_ROUNDS):
-        before, pose = kept, _least_squares(design[kept])
-        value = residuals.value - residuals.pose_jacobian @ pose
-        z = np.abs(value / residuals.sigma)
-        scale = max(1.0, nmad(z[residuals.usable], 0.0))
-        kept = residuals.usable & (z < thresholds().points.registration_outlier_sigmas * scale)
-        if kept.sum() < _FEWEST:
-            kept = residuals.usable
-        if np.array_equal(kept, before):  # converged
-            break
-    return value, pose, scale
+    return RobustPoseFit.of(residuals).fit(residuals.value)
+
+
+@dataclass(frozen=True, eq=False)
+class RobustPoseFit:
+    """Least-squares fits of the sensor's pose to several sets of residuals of the same n points, rejecting outliers.
+
+    What does not depend on the residuals is computed once: derivatives by the pose over sigma, combined to r columns that are
+    orthonormal over the m usable points. Normal equations of most of these points are then well conditioned, so that they are as
+    exact as a QR factorisation, and they follow from the few rejected points. The rank r is less than 6 k if the points do not
+    determine the pose.
+
+    Attributes
+    ----------
+    residuals : Residuals of n points with k set-ups, of which sigma, the usable points and the derivatives by the pose count.
+    rows : (m,) numbers of the usable points.
+    basis : (m, r) orthonormal columns.
+    back : (6 k, r) matrix that makes these columns from the derivatives, and the pose from their coefficients.
+    """
+
+    residuals: Residuals
+    rows: NDArray[np.int64]
+    basis: FloatArray
+    back: FloatArray
+
+    @classmethod
+    def of(cls, residuals: Residuals) -> RobustPoseFit:
+        """Prepare the fit of the pose to usable points. residuals: of n points; their values do not matter."""
+        rows = np.flatnonzero(residuals.usable)
+        columns = np.take(residuals.pose_jacobian, rows, axis=0)
+        columns /= residuals.sigma[rows, None]
+        _, sizes, axes = np.linalg.svd(_triangular_factor(columns), full_matrices=False)
+        told = sizes > np.finfo(float).eps * len(rows) * sizes.max(initial=0.0)
+        back = axes[told].T / sizes[told]
+        return cls(residuals, rows, columns @ back, back)
+
+    def fit(self, value: FloatArray) -> tuple[FloatArray, FloatArray, float]:
+        """Fit the pose of the sensor to residuals, and reject outliers in several rounds.
+
+        value: (n,) residuals, in the unit of the observable (m, or px of disparity).
+
+        Returns
+        -------
+        tuple : as `fit_pose_robustly` returns it.
+        """
+        sigma, most = self.residuals.sigma, thresholds().points.registration_outlier_sigmas
+        weighted = np.asarray(value[self.rows] / sigma[self.rows], dtype=np.float64)
+        size = whole = weighted @ self.basis
+        kept, scale = np.ones(len(weighted), dtype=bool), 1.0
+        for _ in range(_ROUNDS):
+            rejected = np.flatnonzero(~kept)
+            away = self.basis[rejected]
+            normal = np.eye(len(whole)) - away.T @ away
+            size = np.asarray(np.linalg.lstsq(normal, whole - weighted[rejected] @ away)[0], dtype=np.float64)
+            z = np.abs(weighted - self.basis @ size)
+            scale = max(1.0, nmad(z, 0.0))
+            before, kept = kept, z < most * scale
+            if np.count_nonzero(kept) < _FEWEST:
+                kept = np.ones(len(weighted), dtype=bool)
+            if np.array_equal(kept, before):  # converged
+                break
+        pose = self.back @ size
+        return value - self.residuals.pose_jacobian @ pose, pose, scale
 
 
 def fit_pose(residuals: Residuals, rows: BoolArray | NDArray[np.int64]) -> FloatArray:
@@ -104,13 +154,13 @@ def _least_squares(design: FloatArray) -> FloatArray:
 
 
 def _triangular_factor(design: FloatArray) -> FloatArray:
-    """(m, k) matrix with the same products of columns as `design` (n, k), by repeated QR of groups of rows that fit the cache."""
+    """(k, k) triangle with the same products of columns as `design` (n, k), by repeated QR of rows that fit the cache."""
     while len(design) > _AT_ONCE:
         whole = len(design) // _AT_ONCE * _AT_ONCE
         blocks = design[:whole].reshape(-1, _AT_ONCE, design.shape[1])
         triangles = map_in_threads(_qr_factors, [blocks[start : start + _BLOCKS] for start in range(0, len(blocks), _BLOCKS)])
         design = np.concatenate([*triangles, design[whole:]])
-    return design
+    return np.asarray(np.linalg.qr(design, mode="r"))
 
 
 def _qr_factors(blocks: FloatArray) -> FloatArray:
