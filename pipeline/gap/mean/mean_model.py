@@ -22,12 +22,12 @@ from itertools import product
 
 import numpy as np
 from scipy import sparse
-from scipy.linalg import cholesky
+from scipy.linalg import cholesky, solve_triangular
 from scipy.spatial.distance import pdist, squareform
 from scipy.special import j0
 
 from pipeline.gap.mean.projected_columns import ProjectedColumns, WithinProducts
-from pipeline.gap.mean.within_cell_noise import WithinCellNoise, invert_triangle
+from pipeline.gap.mean.within_cell_noise import WithinCellNoise
 from pipeline.gap.residuals.correlated_noise import NO_CORRELATED_NOISE, GridCorrelatedNoise
 from pipeline.gap.residuals.wall_blocks import WallCells
 from scene.common.keyed_random import KeyedRandom
@@ -138,7 +138,7 @@ class MeanModel:
         self._across = sparse.csr_array(self._planes.T)
         self.within_noise = WithinCellNoise.of(field, self.inverse_sigma, self._planes[: len(cells)])
         variance = self.within_noise.mean_covariance()
-        self._unroot = invert_triangle(cholesky(variance, lower=True))
+        self._root = cholesky(variance, lower=True)
         self.typical_sigma = typical = float(np.median(np.sqrt(np.diag(variance) / self._total)))
         scale = typical * np.sqrt(self._total)
         distance = pdist(cells.centre / cells.side_m)
@@ -299,7 +299,7 @@ class MeanModel:
 
     def _whitened(self, means: FloatArray) -> FloatArray:
         """Cell means (m, k) transformed so that their noise is independent with variance 1."""
-        return means if self.within_noise.is_white else np.asarray(self._unroot @ means)
+        return means if self.within_noise.is_white else np.asarray(solve_triangular(self._root, means, lower=True))
 
     def project(self, weighted: FloatArray) -> ProjectedColumns:
         """Divide design columns into cell means and deviations within cells, in the form that all fits use.

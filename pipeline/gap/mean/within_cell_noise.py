@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy import sparse
-from scipy.linalg import cholesky, solve_triangular
+from scipy.linalg import cho_solve, cholesky, solve_triangular
 
 from pipeline.gap.residuals.correlated_noise import NodeField
 from scene.common.keyed_random import KeyedRandom
@@ -35,15 +35,14 @@ class WithinCellNoise:
     white : Share w of white noise in the variance.
     nodes : (n, q) bilinear weights over sigma, before cell means are subtracted; q = 0 if all noise is white.
     means : (m, q) cell means of these weights, divided by the standard deviation that white noise gives a cell mean.
-    prior : (q, q) lower Cholesky factor of C.
-    unroot : (q, q) inverse of the lower Cholesky factor of K. Products with it, unlike SciPy's solvers, run in parallel threads.
+    prior, root : (q, q) lower Cholesky factors of C and of K.
     """
 
     white: float
     nodes: sparse.csr_array
     means: FloatArray
     prior: FloatArray
-    unroot: FloatArray
+    root: FloatArray
 
     @classmethod
     def of(cls, field: NodeField, inverse_sigma: FloatArray, gathered: sparse.csr_array) -> WithinCellNoise:
@@ -63,7 +62,7 @@ class WithinCellNoise:
             return cls(1.0, nodes, means, field.covariance, field.covariance)
         white = max(1 - field.variance * float(np.mean(inverse_sigma**2)), _LEAST_WHITE)
         matrix = (nodes.T @ nodes).toarray() - means.T @ means + white * field.precision
-        return cls(white, nodes, means, field.root, invert_triangle(cholesky(matrix, lower=True)))
+        return cls(white, nodes, means, field.root, cholesky(matrix, lower=True))
 
     def mean_covariance(self) -> FloatArray:
         """Return the (m, m) covariance of the noise in the means of m cells of the wall.
@@ -109,7 +108,7 @@ class WithinCellNoise:
         -------
         (q, k) columns a.
         """
-        return np.asarray(self.unroot.T @ self.whiten(on_nodes))
+        return np.asarray(cho_solve((self.root, True), on_nodes)) if len(self.root) else on_nodes
 
     def whiten(self, on_nodes: FloatArray) -> FloatArray:
         """Transform k columns b over the q nodes of the pixel grid to a = L^-1 b, so that a' a = b' K^-1 b.
@@ -124,7 +123,7 @@ class WithinCellNoise:
         -------
         (q, k) columns a.
         """
-        return np.asarray(self.unroot @ on_nodes)
+        return np.asarray(solve_triangular(self.root, on_nodes, lower=True)) if len(self.root) else on_nodes
 
     def draw(self, white: FloatArray, rows: slice, cell_sums: FloatArray, random: KeyedRandom) -> FloatArray:
         """Simulate noise that neighbouring points share, in a form that quickly gives its effect on any fitted coefficient.
@@ -149,13 +148,8 @@ class WithinCellNoise:
         -------
         (q, d) vectors f, one for each draw.
         """
-        own = random.generator().standard_normal((len(self.unroot), white.shape[1]))
+        own = random.generator().standard_normal((len(self.root), white.shape[1]))
         if not self.is_white:
             own = solve_triangular(self.prior, own, lower=True, trans="T")
         shared = self.nodes[rows].T @ white - self.means.T @ cell_sums
         return self.solve(own - shared / np.sqrt(self.white))
-
-
-def invert_triangle(root: FloatArray) -> FloatArray:
-    """Return the inverse of a lower triangular matrix (k, k), such as a Cholesky factor, which whitens by a product."""
-    return np.asarray(solve_triangular(root, np.eye(len(root)), lower=True))
