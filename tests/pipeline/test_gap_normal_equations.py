@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from test_gap_shared_noise import NOISE, SIGMA, noisy, raster
 
+from pipeline.change.robust import nmad
 from pipeline.gap.mean.candidates import Candidate, SineGrid
 from pipeline.gap.mean.design import Design
 from pipeline.gap.mean.mean_model import MeanFit, MeanModel, _NormalEquations
@@ -15,7 +16,7 @@ from pipeline.gap.mean.nonparametric_terms import nonparametric_terms
 from pipeline.gap.mean.projected_columns import WithinProducts
 from pipeline.gap.mean.search import MeanSearch
 from pipeline.gap.residuals import wall_blocks
-from pipeline.gap.residuals.alignment import fit_pose
+from pipeline.gap.residuals.alignment import fit_pose, fit_pose_robustly
 from pipeline.gap.residuals.correlated_noise import GridCorrelatedNoise
 from scene.common.keyed_random import KeyedRandom
 
@@ -93,6 +94,28 @@ def test_the_pose_is_that_of_least_squares_however_many_points(design: Design, t
         part = replace(part, pose_jacobian=pose, value=pose @ np.arange(1.0, 7.0) + random.standard_normal(count))
         expected = np.linalg.lstsq(pose / SIGMA, part.value / SIGMA, rcond=None)[0]
         np.testing.assert_allclose(fit_pose(part, np.ones(count, dtype=bool)), expected, rtol=1e-9, atol=1e-12)
+
+
+@pytest.mark.parametrize("told", [6, 4])
+def test_the_robust_pose_is_that_of_repeated_least_squares_without_the_outliers(design: Design, told: int) -> None:
+    """One point in ten is an outlier of about 20 sigmas, one in seven is unusable; also with two undetermined parameters."""
+    random, rows = np.random.default_rng(4), np.arange(len(design.residuals))
+    pose = random.standard_normal((len(rows), 6)) * [1, 10, 1e-3, 1, 1, 1]
+    pose[:, told:] = np.stack([np.zeros(len(rows)), pose[:, 0]], axis=1)[:, : 6 - told]
+    value = pose @ np.arange(1.0, 7.0) + SIGMA * random.standard_normal(len(rows)) * np.where(rows % 10, 1, 20)
+    usable = rows % 7 > 0
+    part = replace(design.residuals, pose_jacobian=pose, value=np.where(usable, value, np.nan), usable=usable)
+    kept, scale = usable, 1.0
+    for _ in range(6):
+        found = np.linalg.lstsq(pose[kept], value[kept], rcond=None)[0]
+        z = np.abs(value - pose @ found) / SIGMA
+        scale = nmad(z[usable], 0.0)
+        kept = usable & (z < 3.5 * scale)
+    left, expected, ratio = fit_pose_robustly(part)
+    assert kept.sum() < 0.95 * usable.sum()
+    np.testing.assert_allclose(expected, found, rtol=1e-9, atol=1e-12)
+    np.testing.assert_allclose(left[usable], (value - pose @ found)[usable], atol=1e-9)
+    assert ratio == pytest.approx(max(scale, 1.0), rel=1e-9)
 
 
 def test_covariances_that_are_kept_are_those_that_were_likely(design: Design) -> None:

@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
+from operator import call
 
 import numpy as np
 from numpy.typing import NDArray
@@ -129,7 +130,6 @@ class _EdgeData:
 
     @cached_property
     def _pose_fit(self) -> RobustPoseFit:
-        """Fits of the pose beside an effect."""
         return RobustPoseFit.of(self.residuals)
 
     def shift(self, effects: list[Effect]) -> FloatArray:
@@ -144,11 +144,15 @@ class _EdgeData:
         gains[rows] = log_density(self.registered_residuals[rows], shift[rows], self.sigma[rows]) - self.density[rows]
         return gains
 
-    def registered_density(self, effects: list[Effect]) -> FloatArray:
-        """(n,) log density with further effects, and with the pose and the noise that are fitted beside them; 0 if held out."""
+    def _registered(self, effects: list[Effect]) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """(n,) registered residuals beside further effects, their shift of the disparities, and the standard deviations, px."""
         shift = self.shift(effects)
         value, _, scale = self._pose_fit.fit(self.residuals.value - shift)
-        return np.where(self.held_out, 0.0, log_density(value + shift, shift, scale * self.residuals.sigma))
+        return value + shift, shift, scale * self.residuals.sigma
+
+    def registered_density(self, effects: list[Effect]) -> FloatArray:
+        """(n,) log density with further effects, and with the pose and the noise that are fitted beside them; 0 if held out."""
+        return np.where(self.held_out, 0.0, log_density(*self._registered(effects)))
 
     @cached_property
     def registered_density_without(self) -> FloatArray:
@@ -186,16 +190,12 @@ class _EdgeData:
 
     def registered_with(self, effect: Effect) -> _EdgeData:
         """Repeat the registration and the noise estimate with an effect beside the known ones."""
-        shift = np.nan_to_num(self.shift([effect]))
-        value, _, scale = self._pose_fit.fit(self.residuals.value - shift)
-        return replace(self, registered_residuals=value + shift, sigma=scale * self.residuals.sigma)
+        value, _, sigma = self._registered([effect])
+        return replace(self, registered_residuals=value, sigma=sigma)
 
     def likelier(self, found: list[EdgeEffect]) -> EdgeEffect:
         """Return the more likely of effects that can imitate each other."""
         return max(found, key=lambda each: float(self.registered_density([each.effect]).sum()))
-
-
-_EffectSearch = Callable[[_EdgeData], EdgeEffect | None]
 
 
 def find_disparity_edge_effects(
@@ -239,7 +239,7 @@ def _search(data: _EdgeData) -> list[EdgeEffect]:
         touched = np.any([np.zeros(len(untouched.sigma), dtype=bool), *(each.touched for each in found)], axis=0)
         return _find_smoothing(replace(untouched, held_out=untouched.held_out | touched))
 
-    searches: dict[str, _EffectSearch] = {
+    searches: dict[str, Callable[[_EdgeData], EdgeEffect | None]] = {
         EdgeFattening.tag(): _find_fattening,
         Smoothing.tag(): smoothing,
         OcclusionFill.tag(): _find_filling,
@@ -248,10 +248,10 @@ def _search(data: _EdgeData) -> list[EdgeEffect]:
         del searches[name]
     while searches:
         current = replace(data, beside=[*data.beside, *(each.effect for each in found)])
-        results = zip(searches, map_in_threads(partial(_run_search, current), searches.values()), strict=True)
+        found_now = map_in_threads(call, [partial(search, current) for search in searches.values()])
         # no prediction is exact, so a further effect must explain more than the inexact part of those before
         needed = thresholds().mean.class_share * max([0.0, *(each.gain for each in found)])
-        tried = {name: each for name, each in results if each is not None and each.gain > needed}
+        tried = {name: each for name, each in zip(searches, found_now, strict=True) if each is not None and each.gain > needed}
         if not tried:
             break
         similar = [tried.pop(name) for name in (EdgeFattening.tag(), Smoothing.tag()) if name in tried]
@@ -319,11 +319,6 @@ def _log_likelihood_with_edge_effects(data: _EdgeData | None, count: int) -> flo
         return -np.inf
     density = data.registered_density([each.effect for each in _search(data)])
     return float(density.sum() / max(np.count_nonzero(~data.held_out), 1) * count)
-
-
-def _run_search(data: _EdgeData, search: _EffectSearch) -> EdgeEffect | None:
-    """Run one search; the order of arguments suits `functools.partial`."""
-    return search(data)
 
 
 def _unpredictable_points(effect: Effect, beside: list[Effect], raster: DisparityRaster, residuals: StereoResiduals) -> BoolArray:

@@ -73,12 +73,14 @@ class RobustPoseFit:
     residuals : Residuals of n points with k set-ups, of which sigma, the usable points and the derivatives by the pose count.
     rows : (m,) numbers of the usable points.
     basis : (m, r) orthonormal columns.
+    gram : (r, r) their products with each other, which differ from the unit matrix by rounding.
     back : (6 k, r) matrix that makes these columns from the derivatives, and the pose from their coefficients.
     """
 
     residuals: Residuals
     rows: NDArray[np.int64]
     basis: FloatArray
+    gram: FloatArray
     back: FloatArray
 
     @classmethod
@@ -90,7 +92,8 @@ class RobustPoseFit:
         _, sizes, axes = np.linalg.svd(_triangular_factor(columns), full_matrices=False)
         told = sizes > np.finfo(float).eps * len(rows) * sizes.max(initial=0.0)
         back = axes[told].T / sizes[told]
-        return cls(residuals, rows, columns @ back, back)
+        basis = columns @ back
+        return cls(residuals, rows, basis, basis.T @ basis, back)
 
     def fit(self, value: FloatArray) -> tuple[FloatArray, FloatArray, float]:
         """Fit the pose of the sensor to residuals, and reject outliers in several rounds.
@@ -108,8 +111,7 @@ class RobustPoseFit:
         for _ in range(_ROUNDS):
             rejected = np.flatnonzero(~kept)
             away = self.basis[rejected]
-            normal = np.eye(len(whole)) - away.T @ away
-            size = np.asarray(np.linalg.lstsq(normal, whole - weighted[rejected] @ away)[0], dtype=np.float64)
+            size = np.linalg.lstsq(self.gram - away.T @ away, whole - weighted[rejected] @ away)[0].astype(np.float64)
             z = np.abs(weighted - self.basis @ size)
             scale = max(1.0, nmad(z, 0.0))
             before, kept = kept, z < most * scale
