@@ -9,19 +9,24 @@ import numpy as np
 import pytest
 
 from pipeline.gap.mean.candidates import Candidate
-from pipeline.gap.mean.selection import SelectedEffect
+from pipeline.gap.mean.selection import FamilyScore, SelectedEffect
 from pipeline.gap.naming.named_effects import Estimate
 from pipeline.gap.naming.nonlinear_refit import _gain_over, _ranked_on_common_points, _SingleFit, _with_equivalence_class
+from pipeline.gap.naming.search_outcome import SearchOutcome
 
 CHI2: Any = SimpleNamespace(design=SimpleNamespace(log_likelihood=lambda value, _: -0.5 * float(value @ value)))
 """Stands for a search whose likelihood is that of white noise."""
 
 
-def fit(name: str, value: list[float], used: list[bool]) -> _SingleFit:
-    """Return a fit with the given residuals; what is not used counts as 0."""
-    kept, nothing = np.array(used), np.zeros(1)
-    candidate = Candidate(name, nothing[:, None], lambda _: {}, ("a",))
-    estimate = Estimate(SelectedEffect(candidate, (), 0.002, 200.0, 199.0, ()), candidate, nothing, np.eye(1))
+def estimated(name: str, alike: tuple[str, ...] = (), scores: tuple[FamilyScore, ...] = ()) -> Estimate:
+    """Return an effect with a log-likelihood ratio of 200, so that the margin of a class is 3, and the effects like it."""
+    candidate = Candidate(name, np.zeros((1, 1)), lambda _: {}, ("a",))
+    return Estimate(SelectedEffect(candidate, alike, 0.002, 200.0, 199.0, scores), candidate, np.zeros(1), np.eye(1))
+
+
+def fit(name: str, value: list[float], used: list[bool], alike: tuple[str, ...] = ()) -> _SingleFit:
+    """Return a fit with the given residuals; what is not used counts as 0. alike: its class in the linearised search."""
+    kept, estimate = np.array(used), estimated(name, alike)
     values, absent = np.where(kept, value, 0.0), Any
     return _SingleFit(estimate, absent, absent, values, kept, CHI2.design.log_likelihood(values, None))  # type: ignore[arg-type]
 
@@ -41,3 +46,30 @@ def test_clearly_different_fits_are_no_class() -> None:
     ranked = _ranked_on_common_points([fit("a", [0.0, 5.0], [True, True]), fit("b", [0.0, 1.0], [True, True])], CHI2)
     assert [each.name for each in ranked] == ["b", "a"]
     assert _with_equivalence_class(ranked).estimate.chosen.indistinguishable == ()
+
+
+@pytest.mark.parametrize(("worse", "alike"), [(3.5, ("a",)), (6.5, ())])
+def test_what_the_linearised_search_could_not_tell_apart_must_differ_clearly(worse: float, alike: tuple[str, ...]) -> None:
+    """It must differ by twice the margin of 3, and another effect by the margin alone."""
+    away = float(np.sqrt(2 * worse))
+    ranked = [fit("b", [0.0], [True], ("a",)), fit("a", [away], [True]), fit("c", [away], [True])]
+    assert _with_equivalence_class(ranked).estimate.chosen.indistinguishable == alike
+
+
+def outcome(estimates: list[Estimate], together: bool = True) -> SearchOutcome:
+    """Return an explanation by some effects, found together or one by one."""
+    first = [each.chosen for each in estimates]
+    return SearchOutcome(first if together else first[:1], estimates, Any, Any, [], ())  # type: ignore[arg-type]
+
+
+def test_effects_of_an_explanation_keep_the_classes_of_the_linearised_search_unless_it_tells_them_apart() -> None:
+    """Beside y, effect x scores 199; a scores 5 less, which is within twice the margin of 3, and b scores 7 less."""
+    by = estimated("x").candidate
+    scores = tuple(FamilyScore(name, False, score, score, by, False) for name, score in (("a", 194.0), ("b", 192.0)))
+    linear = outcome([estimated("x", ("a", "b")), estimated("y")])
+    found = outcome([estimated("x", (), scores), estimated("y", ("c",))]).with_classes_of(linear)
+    assert [each.chosen.indistinguishable for each in found.estimates] == [("a",), ("c",)]
+    refitted = outcome([estimated("x", (), scores), estimated("y")], together=False).with_classes_of(linear)
+    assert refitted.estimates[0].chosen.indistinguishable == ("a", "b")
+    other = outcome([estimated("x"), estimated("z")])
+    assert other.with_classes_of(linear) is other

@@ -26,8 +26,6 @@ from pipeline.gap.naming.candidate_families import candidate_families
 from pipeline.gap.naming.effect_screening import screen_effects
 from pipeline.gap.naming.named_effects import NamedEffect, effect_from_estimate
 from pipeline.gap.naming.nonlinear_refit import (
-    SearchInput,
-    SearchOutcome,
     _screened_single_fits,
     _strongest_single_fits,
     _with_equivalence_class,
@@ -35,6 +33,7 @@ from pipeline.gap.naming.nonlinear_refit import (
     search_at_joint_fit,
     select_and_refit,
 )
+from pipeline.gap.naming.search_outcome import SearchInput, SearchOutcome
 from pipeline.gap.naming.search_residuals import with_fitted_variance
 from pipeline.gap.naming.selection_passes import PassInput, PassInputs
 from pipeline.gap.naming.validation_scores import validate_effects

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -15,12 +15,11 @@ from pipeline.gap.mean.selection import FamilyScore, SelectedEffect
 from pipeline.gap.naming.candidate_families import PERIODIC, candidate_families, catalogue_families
 from pipeline.gap.naming.effect_screening import estimate_of_size, gauss_newton_step, screen_effects
 from pipeline.gap.naming.named_effects import Estimate, aligned_with, effect_from_estimate, out_of_bounds
+from pipeline.gap.naming.search_outcome import SearchInput, SearchOutcome
 from pipeline.gap.naming.search_residuals import with_added_variance, with_fitted_variance
-from pipeline.gap.noise_and_edges.variance_model import VarianceTerm
 from pipeline.gap.residuals.alignment import AlignedMeasurement, at_points_of, fit_pose_robustly
 from pipeline.gap.residuals.residuals import BoolArray, Residuals
 from pipeline.gap.thresholds import equivalence_margin, thresholds
-from scene.common.keyed_random import KeyedRandom
 from scene.geometry.mesh import FloatArray
 
 _MOST_CONVERGED, _MOST_ROUNDS, _CONVERGED_GAIN = 3, 8, 1.0
@@ -29,63 +28,6 @@ _ABSORBED_SHARE = 0.5
 """Share of an effect's gain that may be linearisation error of the others."""
 _MOST_FITS, _CONVERGED_DECREASE = 10, 0.005
 """Most iterations of the joint fit of all effects."""
-
-
-@dataclass(frozen=True)
-class SearchInput:
-    """Input that all searches for systematic sensor errors (effects) in one measurement share.
-
-    Attributes
-    ----------
-    measurement : the training points (those that are not kept for validation), with their sensor model.
-    part : residuals of these points, measured minus predicted.
-    families : effects to search, as regression terms. A sinusoidal effect comes with all its trial frequencies as one
-        `SineGrid`.
-    variance_at : function that fits noise terms to residuals and returns them. The noise is fitted anew whenever effects are put
-        into the model, because residuals change then.
-    added : variance to add to the predicted one, squared unit of the observable; it covers errors found before, such as
-        rounding.
-    random : source of random numbers for the null distributions.
-    """
-
-    measurement: Measurement
-    part: Residuals
-    families: list[Candidate | SineGrid]
-    variance_at: Callable[[Residuals], list[VarianceTerm]]
-    added: float
-    random: KeyedRandom
-
-
-@dataclass(frozen=True)
-class SearchOutcome:
-    """One explanation of the residuals by systematic sensor errors (effects), found by one or two searches.
-
-    The second search finds further effects, with those of the first in the sensor model without linearisation.
-
-    Attributes
-    ----------
-    chosen : effects that the first search selected.
-    estimates : effects of both searches with their coefficients.
-    search : the last search: the second one, or the first if there was no second.
-    residuals : residuals that the last search explains.
-    further : effects that the last search selected.
-    tried : scores of all candidate effects beside those that the last search selected.
-    """
-
-    chosen: list[SelectedEffect]
-    estimates: list[Estimate]
-    search: MeanSearch
-    residuals: Residuals
-    further: list[SelectedEffect]
-    tried: tuple[FamilyScore, ...]
-
-    @property
-    def complexity(self) -> tuple[int, int]:
-        """Number of empirical terms in this explanation of residuals, then number of all effects, to prefer the simplest one.
-
-        Pairs are compared in this order; empirical terms name no cause.
-        """
-        return sum(each.candidate.empirical for each in self.estimates), len(self.estimates)
 
 
 @dataclass(frozen=True)
@@ -192,7 +134,7 @@ def select_and_refit(given: SearchInput, first: MeanSearch) -> SearchOutcome:
     best = _simpler(given, best, linear, ties=not alone)
     if best is None or best.complexity > (0, 1):
         best = _simpler(given, best, search_at_joint_fit(given), ties=False)
-    return best or linear
+    return linear if best is None else best.with_classes_of(linear)
 
 
 def _simpler(given: SearchInput, best: SearchOutcome | None, other: SearchOutcome | None, ties: bool) -> SearchOutcome | None:
@@ -362,13 +304,14 @@ def _search_beside_best(given: SearchInput, plain: SearchOutcome, alone: list[_S
 def _with_equivalence_class(converged: list[_SingleFit]) -> _SingleFit:
     """Return the best of the refitted single effects with the effects that cannot be told from it (its equivalence class).
 
-    For effects that were not refitted, the linearised search decides.
+    For effects that were not refitted, the linearised search decides. One that it could not tell from the best must score worse
+    by twice the margin here, because either search has its own error.
     """
     best, *others = converged
     chosen = best.estimate.chosen
-    least = best.score - equivalence_margin(chosen.log_likelihood_ratio)
-    near = {each.name for each in others if each.score > least}
-    linearised = set(chosen.indistinguishable) - {each.name for each in others}
+    margin, linearised = equivalence_margin(chosen.log_likelihood_ratio), set(chosen.indistinguishable)
+    near = {each.name for each in others if each.score > best.score - (1 + (each.name in linearised)) * margin}
+    linearised -= {each.name for each in others}
     return replace(
         best, estimate=replace(best.estimate, chosen=replace(chosen, indistinguishable=tuple(sorted(near | linearised))))
     )
