@@ -103,11 +103,11 @@ class MeanThresholds(ThresholdGroup):
     class_margin: PositiveFloat = threshold_field(
         3.0,
         "log-likelihood",
-        "Effects whose score is within this of the best one belong to its equivalence class, noise terms likewise. The "
-        "linearised model is used if it misjudges the strongest effect by less. Amplitudes of pixel locking whose chi^2 differ "
-        "by less than twice this fit equally well, and the smallest is taken. The gain of one point at a depth step is clipped "
-        "at this before the wall blocks are compared. The likelihood factor exp(-3) bounds by 5 % how often the true effect is "
-        "left out.",
+        "Effects whose score is within this of the best one belong to its equivalence class, noise terms likewise. Where a fit "
+        "without linearising follows, it must tell members of the class apart by twice this. The linearised model is used if it "
+        "misjudges the strongest effect by less. Amplitudes of pixel locking whose chi^2 differ by less than twice this fit "
+        "equally well, and the smallest is taken. The gain of one point at a depth step is clipped at this before the wall "
+        "blocks are compared. The likelihood factor exp(-3) bounds by 5 % how often the true effect is left out.",
         "target of 93 to 97 % of classes that contain the true effect",
     )
     class_share: PositiveFloat = threshold_field(
