@@ -211,10 +211,13 @@ def _log_score_gains(
 ) -> FloatArray:
     """(b,) log score with an effect minus that without, in each wall block. Outliers of both models are left out.
 
+    Empty if no point is left, as where the effects move the rays off the wall or make an edge of all of it.
     rows: (n,) points to score; at: (n, 2) places on the wall, m; block: (n,) wall block of each point; sigma: standard
     deviation of the reference error.
     """
     chosen = np.flatnonzero(rows & (_inliers(with_all) | _inliers(without)))
+    if not len(chosen):
+        return np.zeros(0)
     patch = wall_blocks_by_points(at[chosen], _POINTS_PER_PATCH)
     noises = {each.effects: each for each in (with_all.shared, without.shared)}  # one if the effect is no grid-correlated noise
     found = []
