@@ -110,7 +110,7 @@ _CAUSES = {
         "the validation blocks"
     ),
     "`light`, row_jitter": (
-        "the answer changes with the last digits of the estimated pose, because many rays hit edges of the reference's mesh, which "
+        "the answer changes with the last digits of the estimated pose, because many rays hit edges of the reference, whose mesh "
         "was made from the same pixels; with other last digits the jitter was named rightly"
     ),
     "`matcher`": (
