@@ -21,10 +21,17 @@ from pipeline.gap.mean.nonparametric_terms import SPATIAL_NULL
 from pipeline.gap.mean.selection import EffectSet, FamilyScore, ForwardSelection
 from pipeline.gap.naming.named_effects import NamedEffect
 from pipeline.gap.naming.selection_passes import subsample
-from pipeline.gap.naming.validation_scores import blocks_agree, describe_weakness, validate_effects
+from pipeline.gap.naming.validation_scores import (
+    _log_score_gains,
+    _RegisteredResiduals,
+    blocks_agree,
+    describe_weakness,
+    validate_effects,
+)
 from pipeline.gap.naming.workflow import diagnose
 from pipeline.gap.noise_and_edges.variance_model import fit_variance_model, variance_candidates
 from pipeline.gap.residuals.alignment import align, fit_pose_robustly
+from pipeline.gap.residuals.correlated_noise import NO_CORRELATED_NOISE
 from pipeline.gap.residuals.wall_blocks import WallCells, in_validation_blocks
 from scene.common.keyed_random import KeyedRandom
 
@@ -260,3 +267,11 @@ def test_an_effect_beside_a_free_form_says_more_than_a_form_of_two_covariates(su
 
     chosen, _ = ForwardSelection(_Scripted(scores)).select()
     assert {each.candidate.name for each in chosen} == named
+
+
+def test_effects_that_leave_no_point_to_score_gain_nothing() -> None:
+    """With them, no ray of the validation blocks meets smooth rock: residuals are NaN there."""
+    count = 300
+    with_all = _RegisteredResiduals(np.full(count, np.nan), np.ones(count), NO_CORRELATED_NOISE)
+    place, block = np.zeros((count, 2)), np.zeros(count, dtype=np.int64)
+    assert not len(_log_score_gains(with_all, with_all, np.isfinite(with_all.value), place, block, 0.0))
