@@ -267,7 +267,7 @@ def test_no_effects_are_searched_beside_an_explanation_that_cannot_be_simpler(
     other_wins: bool,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """Explanations are given as their numbers of effects of the catalogue and of empirical terms."""
+    """Each explanation is given by two numbers: of its effects of the catalogue, and of its empirical terms."""
     tried: list[Any] = []
     monkeypatch.setattr(nonlinear_refit, "_search_beside", lambda _, outcome: tried.append(outcome))
     monkeypatch.setattr(nonlinear_refit, "_within_bounds", lambda *_: True)

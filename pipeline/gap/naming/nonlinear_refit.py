@@ -138,7 +138,7 @@ def select_and_refit(given: SearchInput, first: MeanSearch) -> SearchOutcome:
 
 
 def _simpler(given: SearchInput, best: SearchOutcome | None, other: SearchOutcome | None, ties: bool) -> SearchOutcome | None:
-    """Return the simpler of two explanations of the residuals. Before, effects that the second one lacks are searched.
+    """Return the simpler of two explanations of the residuals, after a search for effects that the second one may lack.
 
     That search only adds effects, so it is left out where the second explanation cannot be simpler.
     best: the first explanation; None if there is none. ties: whether the second one is returned if both are equally simple.
