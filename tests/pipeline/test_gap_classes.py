@@ -19,7 +19,10 @@ CHI2: Any = SimpleNamespace(design=SimpleNamespace(log_likelihood=lambda value, 
 
 
 def estimated(name: str, alike: tuple[str, ...] = (), scores: tuple[FamilyScore, ...] = ()) -> Estimate:
-    """Return an effect with a log-likelihood ratio of 200, so that the margin of a class is 3, and the effects like it."""
+    """Return an effect with a log-likelihood ratio of 200, for which effects within a score of 3 cannot be told apart.
+
+    alike: the class that a search gave it; scores: those of all effects in its place.
+    """
     candidate = Candidate(name, np.zeros((1, 1)), lambda _: {}, ("a",))
     return Estimate(SelectedEffect(candidate, alike, 0.002, 200.0, 199.0, scores), candidate, np.zeros(1), np.eye(1))
 
@@ -50,14 +53,14 @@ def test_clearly_different_fits_are_no_class() -> None:
 
 @pytest.mark.parametrize(("worse", "alike"), [(3.5, ("a",)), (6.5, ())])
 def test_what_the_linearised_search_could_not_tell_apart_must_differ_clearly(worse: float, alike: tuple[str, ...]) -> None:
-    """It must differ by twice the margin of 3, and another effect by the margin alone."""
+    """Effect a stays in the class of b up to a difference of 6, and effect c, which was told apart before, up to 3."""
     away = float(np.sqrt(2 * worse))
     ranked = [fit("b", [0.0], [True], ("a",)), fit("a", [away], [True]), fit("c", [away], [True])]
     assert _with_equivalence_class(ranked).estimate.chosen.indistinguishable == alike
 
 
 def outcome(estimates: list[Estimate], together: bool = True) -> SearchOutcome:
-    """Return an explanation by some effects, found together or one by one."""
+    """Return an explanation of residuals by some effects. together: whether one search selected all of them."""
     first = [each.chosen for each in estimates]
     return SearchOutcome(first if together else first[:1], estimates, Any, Any, [], ())  # type: ignore[arg-type]
 

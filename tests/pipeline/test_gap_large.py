@@ -242,7 +242,7 @@ def test_effects_are_tried_one_by_one_where_several_weak_ones_seem_needed(
 
 
 def _explanation(physical: int, empirical: int) -> Any:
-    """Return an explanation with so many effects of the catalogue and empirical terms."""
+    """Return an explanation with the given numbers of effects of the catalogue and of empirical terms."""
     kinds = [False] * physical + [True] * empirical
     estimates = [SimpleNamespace(candidate=SimpleNamespace(empirical=each)) for each in kinds]
     return SimpleNamespace(chosen=estimates, estimates=estimates, complexity=(empirical, len(kinds)))

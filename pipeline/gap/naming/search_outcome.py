@@ -1,4 +1,4 @@
-"""What the searches for systematic sensor errors of one measurement share, and an explanation that they find."""
+"""Define the input of the searches for systematic sensor errors in one measurement, and the explanation that a search finds."""
 
 from __future__ import annotations
 

@@ -211,7 +211,7 @@ def _log_score_gains(
 ) -> FloatArray:
     """(b,) log score with an effect minus that without, in each wall block. Outliers of both models are left out.
 
-    Empty if no point is left, as where the effects move the rays off the wall or make an edge of all of it.
+    Empty if no point can be scored: with large effects, rays may miss the wall, or all may hit edges.
     rows: (n,) points to score; at: (n, 2) places on the wall, m; block: (n,) wall block of each point; sigma: standard
     deviation of the reference error.
     """

@@ -145,7 +145,7 @@ class _EdgeData:
         return gains
 
     def _registered(self, effects: list[Effect]) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """(n,) registered residuals beside further effects, their shift of the disparities, and the standard deviations, px."""
+        """Residuals (n,) after a pose fit with further effects in the model, their shift, and standard deviations, px."""
         shift = self.shift(effects)
         value, _, scale = self._pose_fit.fit(self.residuals.value - shift)
         return value + shift, shift, scale * self.residuals.sigma
