@@ -7,7 +7,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from pipeline.gap.noise_and_edges.pixel_locking import NoiseBounds, find_locking
+from pipeline.gap.noise_and_edges.pixel_locking import Locking, NoiseBounds, find_locking
 from sensors.effects.pixel_locking import PixelLocking
 
 
@@ -98,3 +98,52 @@ def test_a_matcher_whose_rectification_is_turned_about_the_base_is_seen_through(
     )
     mean = effect.mean(SimpleNamespace(found=ours, tangent=tangent, infinity=infinity))
     assert np.corrcoef(mean, np.sin(2 * np.pi * locked))[0, 1] > 0.98
+
+
+@pytest.mark.parametrize(
+    ("amplitude", "before", "after"),
+    [
+        *((amplitude, *noise) for amplitude in (0.13, 0.25, 0.4) for noise in ((0.3, 0), (0, 0.3))),
+        (0.13, 0.2, 0.2),
+        (0.25, 0.2, 0.2),
+    ],
+)
+def test_amplitude_is_found_whether_noise_comes_before_or_after_the_locking(
+    amplitude: float, before: float, after: float
+) -> None:
+    """The amplitude is within three standard deviations and a fifth of the truth, in matched pixels of two pixels each."""
+    random = np.random.default_rng(7)
+    surface = random.uniform(100, 160, 20_000)
+    x = surface + before * random.standard_normal(20_000)
+    disparity = 2 * (x + amplitude * np.sin(2 * np.pi * x + 1.0) + after * random.standard_normal(20_000))
+    residual = disparity - 2 * surface
+    noise = NoiseBounds(2 * np.hypot(before, after), float(np.std(residual)))
+    found = find_locking(disparity, 2 * surface, noise=noise, residual=residual)
+    assert found is not None
+    assert found.amplitude_px == pytest.approx(2 * amplitude, abs=max(3 * found.std_px, 0.004))
+    assert found.std_px < 0.2 * found.amplitude_px
+    assert found.period_px == pytest.approx(2, rel=1e-3)
+
+
+def test_the_amplitude_grows_to_explain_more_variance_only_within_its_uncertainty() -> None:
+    """A sine of amplitude A has the variance A^2 / 2."""
+    found = Locking(0.10, 0.03, 1.0, 0.0, 0.0, 100.0)
+    larger = found.with_variance(0.002)
+    assert larger is not None
+    assert larger.amplitude_px**2 / 2 == pytest.approx(0.1**2 / 2 + 0.002)
+    assert found.with_variance(0.02) is None
+
+
+def test_disparities_that_crowd_at_other_frequencies_too_show_no_locking() -> None:
+    """A third of the points lies on ten flat patches that the reference does not have, such as fresh scars.
+
+    They crowd at every frequency, as few independent points do. The significance level is 1e-4 for each wall; the mean over the
+    few frequencies beside is itself uncertain, so two of 40 are allowed.
+    """
+    found = 0
+    for seed in range(40):
+        random = np.random.default_rng(seed)
+        rough = random.uniform(100, 160, 6000)
+        patches = np.repeat(random.uniform(100, 160, 10), 200) + 0.05 * random.standard_normal(2000)
+        found += find_locking(np.append(rough[:4000], patches), rough) is not None
+    assert found <= 2

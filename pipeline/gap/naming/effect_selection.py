@@ -36,7 +36,7 @@ from pipeline.gap.naming.search_outcome import SearchInput, SearchOutcome
 from pipeline.gap.naming.search_residuals import with_added_variance, with_fitted_variance
 from pipeline.gap.noise_and_edges.grid_noise import find_grid_noise, separate_white_and_grid_noise
 from pipeline.gap.noise_and_edges.noise_power import detectable_noise
-from pipeline.gap.noise_and_edges.pixel_locking import NoiseBounds, find_locking
+from pipeline.gap.noise_and_edges.pixel_locking import Locking, NoiseBounds, find_locking
 from pipeline.gap.noise_and_edges.rounded_ranges import find_range_step
 from pipeline.gap.noise_and_edges.tile_seams import detectable_tile_shift, find_tile_seams
 from pipeline.gap.noise_and_edges.variance_model import NoiseRatio, VarianceScore, VarianceTerm, fit_variance_model
@@ -132,6 +132,7 @@ class SelectionInput:
         noise terms are fitted to it. None: the registered residuals.
     grid_noise : noise that neighbouring points share, if a preceding selection found it in its residuals. It is then part of
         the model from the start, because it imitates empirical terms and errors of the reference. None in a first selection.
+    locking : pixel locking whose amplitude a preceding selection found with the noise. None: it is searched for.
     """
 
     measurement: Measurement
@@ -141,6 +142,7 @@ class SelectionInput:
     excluded: frozenset[tuple[str, bool]] = frozenset()
     noise: FloatArray | None = None
     grid_noise: VarianceTerm | None = None
+    locking: Locking | None = None
 
     def registered(self, part: Residuals) -> FloatArray:
         """Return the (n,) residuals to which noise terms are fitted first. part: the residuals, with their predicted noise."""
@@ -189,6 +191,8 @@ def select_effects(given: SelectionInput) -> tuple[list[NamedEffect], SelectionR
         refound, noise = _with_grid_noise(given, part, found, left, noise)
         if refound is not None:
             return select_effects(replace(given, grid_noise=refound))
+    if locking := apart.locking_for(noise):
+        return select_effects(replace(given, locking=locking))
     if wrong := (wrong | noise.implausible(measurement)) - given.excluded:
         again, result = select_effects(given.without(wrong))
         before = frozenset(each.candidate.name for each in found.estimates)
@@ -213,12 +217,13 @@ class _FoundApart:
     """Rounded ranges or locked disparities, which are found before all other effects.
 
     named: the effect; variance: variance of its error, squared unit of the observable; noise_ratio: observed over predicted
-    standard deviation beside it.
+    standard deviation beside it; locking: the pixel locking, if that is the effect.
     """
 
     named: list[NamedEffect]
     variance: float
     noise_ratio: float
+    locking: Locking | None = None
 
     @classmethod
     def of(cls, given: SelectionInput) -> _FoundApart:
@@ -229,11 +234,18 @@ class _FoundApart:
             if step is not None:
                 return cls([effect_from_range_step(step, part)], step.step_m**2 / 12, 1.0)
         if isinstance(part, StereoResiduals) and not model_has(measurement, PixelLocking.tag()):
-            at, allowed = part.geometry, NoiseBounds(float(np.median(part.sigma)), nmad(given.registered(part)))
-            locking = find_locking(at.found, at.disparity, at.tangent, at.infinity, allowed)
+            at, residual = part.geometry, given.registered(part)
+            allowed = NoiseBounds(float(np.median(part.sigma)), nmad(residual))
+            locking = given.locking or find_locking(at.found, at.disparity, at.tangent, at.infinity, allowed, residual)
             if locking is not None:
-                return cls([effect_from_locking(locking)], locking.amplitude_px**2 / 2, given.noise_ratio)
+                return cls([effect_from_locking(locking)], locking.amplitude_px**2 / 2, given.noise_ratio, locking)
         return cls([], 0.0, given.noise_ratio)
+
+    def locking_for(self, noise: _FittedNoise) -> Locking | None:
+        """Return the pixel locking with an amplitude that explains the noise found beside it, if that is plausible."""
+        if self.locking is None or len(noise.terms) != 1 or noise.terms[0].empirical or np.ptp(noise.terms[0].variance) > 0:
+            return None
+        return self.locking.with_variance(float(noise.terms[0].variance[0]))
 
 
 @dataclass(frozen=True)

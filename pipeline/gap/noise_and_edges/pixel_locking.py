@@ -4,6 +4,10 @@ If d' = x + A sin(2 pi x / n + phase) and x is distributed over many pixels, the
 exp(-i phase) (Jacobi-Anger). This also holds where noise in x would average the sine away in the residuals. The k-th multiple of
 the angle gives |Jk(2 pi k A / n)|. Noise of standard deviation s after the locking multiplies it by exp(-2 (pi k s / n)^2).
 
+The residuals show the sine over the reference's disparities. There, noise before the locking and errors of the reference, of
+standard deviation t together, multiply its amplitude by exp(-2 (pi t / n)^2). With the variance of the residuals,
+s^2 + t^2 + A^2 / 2, this tells a small amplitude from a large one that is hidden by noise, whichever comes first.
+
 The rectification in which the disparities were matched is not part of a measurement. Another rectification has another principal
 distance and may be rotated about the base by an angle w, so that d' = s d / (1 + y tan w). Here d is counted from the disparity
 of a point at infinity, and y is the tangent of a row's angle to the axis.
@@ -11,7 +15,7 @@ of a point at infinity, and y is the tangent of a row's angle to the axis.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.optimize import minimize
@@ -27,6 +31,8 @@ _SCALE_UNKNOWN, _TILT_UNKNOWN = 0.03, 0.1
 rad."""
 _SHAPE_BAND = 0.18
 """Relative half-width of the band around the pixel frequency in which crowding of the reference counts as the wall's shape."""
+_BAND_BESIDE = 0.4
+"""The same of the band in which crowding of measured disparities shows how many of the points are independent."""
 _BINS_A_CYCLE, _STEPS_A_CYCLE = 8, 4
 """Bins and trial frequencies for each cycle."""
 _MOST_BINS = 4096
@@ -43,6 +49,10 @@ _MOST_NOISE_PX = 0.35
 _FOLDING, _LARGE_AMPLITUDE, _HARMONIC_MISFIT = 1 / (2 * np.pi), 0.3, 0.02
 """Amplitude from which disparities fold over; amplitude that is large; chi^2 share by which a small amplitude may fit worse,
 because a matcher's error is not exactly a sine."""
+_CLIP = 3.0
+"""Residuals beyond so many standard deviations are clipped."""
+_FIRST_BESIDE, _SINES_BESIDE = 2, 12
+"""Frequencies beside that of the locking: distance of the first one, in cycles over all disparities; number on each side."""
 _MOST_POINTS = 60_000
 
 
@@ -67,10 +77,19 @@ class Locking:
     tilt_rad: float
     gain: float
 
+    def with_variance(self, variance: float) -> Locking | None:
+        """Return the locking with an amplitude that also explains more variance of the residuals, if that is plausible.
+
+        variance: what the residuals vary beside the noise of the sensor model and this locking, px^2. None is returned if the
+        amplitude would be more than two standard deviations larger.
+        """
+        amplitude = float(np.sqrt(self.amplitude_px**2 + 2 * variance))
+        return replace(self, amplitude_px=amplitude) if amplitude < self.amplitude_px + 2 * self.std_px else None
+
 
 @dataclass(frozen=True)
 class NoiseBounds:
-    """Bounds of the standard deviation of matching noise, to estimate the amplitude of pixel locking beside it.
+    """Bounds of the standard deviation of matching noise, before and after pixel locking together.
 
     Without bounds, a small amplitude with much noise could not be told from a large one with little noise.
 
@@ -115,11 +134,13 @@ def find_locking(
     tangent: FloatArray | float = 0.0,
     infinity: FloatArray | float = 0.0,
     noise: NoiseBounds | None = None,
+    residual: FloatArray | None = None,
 ) -> Locking | None:
     """Find pixel locking: measured disparities crowd around certain fractions of a pixel. None if not significant.
 
     A disparity is converted to a phase, in which a whole pixel is 2 pi. The test statistic is R, the mean of exp(i phase) over
-    n points. Without locking, n |R|^2 is exponentially distributed (Rayleigh test).
+    n independent points. Without locking, n |R|^2 is exponentially distributed (Rayleigh test). Points whose disparities are
+    correlated count as fewer independent ones: n is 1 over the mean of |R|^2 at frequencies that no matcher has.
 
     Parameters
     ----------
@@ -128,46 +149,83 @@ def find_locking(
     tangent : (n,) vertical slope of each point's line of sight: (rectified row - principal row) / focal length in px.
     infinity : disparity of a point at infinity, px, from which disparities are counted.
     noise : bounds of the matching noise, px; None if it is unknown.
+    residual : (n,) disparities minus those of the registered reference, px; used with `noise` only. They show the sine, damped
+        by the noise before it.
     """
     every = slice(None, None, max(len(disparity) // _MOST_POINTS, 1))
     far = np.broadcast_to(infinity, disparity.shape)[every]
     disparities, known, rows = disparity[every] - far, reference[every] - far, np.broadcast_to(tangent, disparity.shape)[every]
     count, reach = len(disparities), float(np.ptp(np.quantile(disparities, [0.02, 0.98])))
-    best: tuple[float, float, float, float] | None = None
-    for reduction in _REDUCTIONS:
-        if reach < thresholds().locking.fewest_cycles * reduction:
-            continue
-        whole = 1 / reduction
-        frequency, tilt, _, tries = _strongest_crowding(disparities, rows, whole, _SCALE_UNKNOWN)
-        _, _, strength_of_reference, tries_beside = _strongest_crowding(known, rows, whole, _SHAPE_BAND)
-        shape = np.sqrt(max(strength_of_reference**2 - np.log(tries_beside) / count, 0.0))
-        frequency, tilt = _refine_frequency(disparities, rows, frequency, tilt)
-        strength_found = _crowding(disparities, rows, frequency, tilt)
-        gain = count * max(strength_found - thresholds().locking.crowding_ratio * shape, 0.0) ** 2
-        if best is None or gain > best[0]:
-            best = gain, frequency, tilt, tries
-    if best is None:
+    found = [
+        _Crowding.of(disparities, known, rows, 1 / reduction)
+        for reduction in _REDUCTIONS
+        if reach >= thresholds().locking.fewest_cycles * reduction
+    ]
+    if not found:
         return None
-    gain, frequency, tilt, tries = best
-    p_value = min(1.0, len(_REDUCTIONS) * tries * float(np.exp(-gain)))
+    best = max(found, key=lambda each: each.excess)
+    independent = _independent_points(disparities, rows, best.whole, reach)
+    p_value = min(1.0, len(_REDUCTIONS) * best.tries * float(np.exp(-independent * best.excess**2)))
     if p_value > thresholds().locking.significance:
         return None
-    pixels = frequency * (disparities / (1 + np.tan(tilt) * rows) + far)
+    frequency, turned = best.frequency, 1 + np.tan(best.tilt) * rows
+    pixels = frequency * (disparities / turned + far)
     strength = np.array([abs(np.exp(2j * np.pi * k * pixels).mean()) for k in _MULTIPLES])
-    share, error = _amplitude(strength, count, None if noise is None else noise.in_matched_pixels(frequency))
+    allowed, sine = None if noise is None else noise.in_matched_pixels(frequency), None
+    if noise is not None and residual is not None:
+        left = residual[every]
+        clipped = np.clip(left - np.median(left), -_CLIP * noise.measured, _CLIP * noise.measured)
+        sine = _sine_of_residuals(frequency * clipped, pixels - frequency * left / turned, frequency * reach)
+    share, error = _amplitude(strength, count, allowed, sine)
     first = complex(np.exp(2j * np.pi * pixels).mean())
     phase = float(np.angle(-np.conj(first) * np.sign(j1(2 * np.pi * share))))
-    return Locking(share / frequency, error / frequency, 1 / frequency, phase, tilt, float(gain))
+    return Locking(share / frequency, error / frequency, 1 / frequency, phase, best.tilt, float(count * best.excess**2))
+
+
+@dataclass(frozen=True)
+class _Crowding:
+    """Crowding of disparities around the pixels of an image that is reduced or not.
+
+    whole: frequency of its pixels, 1/px; frequency (1/px), tilt (rad): where the disparities crowd most; excess: mean resultant
+    length of the phases, less what the shape of the wall may cause; tries: number of frequencies and tilts tried.
+    """
+
+    whole: float
+    frequency: float
+    tilt: float
+    excess: float
+    tries: int
+
+    @classmethod
+    def of(cls, disparity: FloatArray, known: FloatArray, tangent: FloatArray, whole: float) -> _Crowding:
+        """Find where the disparities crowd most. known: (n,) disparities of the reference; others as in `_strongest_crowding`."""
+        frequency, tilt, strength = _strongest_crowding(disparity, tangent, whole, _SCALE_UNKNOWN)
+        _, _, of_reference = _strongest_crowding(known, tangent, whole, _SHAPE_BAND)
+        shape = np.sqrt(max(of_reference.max() ** 2 - np.log(of_reference.size) / len(disparity), 0.0))
+        frequency, tilt = _refine_frequency(disparity, tangent, frequency, tilt)
+        excess = _crowding(disparity, tangent, frequency, tilt) - thresholds().locking.crowding_ratio * shape
+        return cls(whole, frequency, tilt, max(excess, 0.0), strength.size)
+
+
+def _independent_points(disparity: FloatArray, tangent: FloatArray, whole: float, reach: float) -> float:
+    """Return the number of independent points that would crowd as much by chance, at frequencies that no matcher has.
+
+    The mean of |R|^2 over n independent points is 1 / n. reach: range of the disparities, px.
+    """
+    near = _SCALE_UNKNOWN * whole + _FIRST_BESIDE / reach
+    _, _, beside = _strongest_crowding(disparity, tangent, whole, max(_BAND_BESIDE, 2 * near / whole), near)
+    return min(len(disparity), 1 / float(np.mean(beside**2)))
 
 
 def _strongest_crowding(
-    disparity: FloatArray, tangent: FloatArray, whole: float, share: float
-) -> tuple[float, float, float, float]:
+    disparity: FloatArray, tangent: FloatArray, whole: float, share: float, near: float = 0.0
+) -> tuple[float, float, FloatArray]:
     """Find the frequency (1/px) and the tilt at which disparities crowd most around whole pixels.
 
-    Returns the frequency, which is within a share of `whole`, the tilt, how strongly they crowd, and the number of trials. The
-    mean of exp(2 pi i f d (1 - w y)) for all f and w is a Fourier transform over d and d y of the phasors of whole pixels. Its
-    frequencies are low, so the phasors are gathered in bins of an eighth of their shortest cycle.
+    Returns the frequency, which is within a share of `whole` but not nearer to it than `near`, the tilt, and how strongly they
+    crowd at each that is tried. The mean of exp(2 pi i f d (1 - w y)) for all f and w is a Fourier transform over d and d y
+    of the phasors of whole pixels. Its frequencies are low, so the phasors are gathered in bins of an eighth of their shortest
+    cycle.
     """
     phasor = np.exp(2j * np.pi * whole * disparity)
     axes = [disparity - disparity.mean(), disparity * tangent]
@@ -181,13 +239,14 @@ def _strongest_crowding(
     for axis in (1, 0):
         reach = max(float(np.ptp(axes[axis])), 1e-9)
         tried = np.arange(-highest[axis], highest[axis], 1 / (_STEPS_A_CYCLE * reach))
+        tried = tried if axis else tried[np.abs(tried) >= near]
         steps.append(tried)
         turned = np.exp(2j * np.pi * tried[:, None] * middles[axis])
         found = found @ turned.T if axis else turned @ found
     strength = np.abs(found) / len(disparity)
     row, column = np.unravel_index(int(np.argmax(strength)), strength.shape)
     frequency = whole + float(steps[1][row])
-    return frequency, -float(steps[0][column]) / frequency, float(strength[row, column]), float(strength.size)
+    return frequency, -float(steps[0][column]) / frequency, strength
 
 
 def _crowding(disparity: FloatArray, tangent: FloatArray, frequency: float, tilt: float) -> float:
@@ -210,22 +269,54 @@ def _refine_frequency(disparity: FloatArray, tangent: FloatArray, frequency: flo
     return frequency + top[0] * unit[0], tilt + top[1] * unit[1]
 
 
-def _amplitude(strength: FloatArray, count: int, noise: NoiseBounds | None) -> tuple[float, float]:
+def _sine_of_residuals(residual: FloatArray, pixels: FloatArray, cycles: float) -> tuple[float, float]:
+    """Return the amplitude of the sine in the residuals and its standard deviation, in matched pixels.
+
+    The standard deviation follows from sines of other frequencies nearby, so it contains what is correlated in the residuals.
+
+    Parameters
+    ----------
+    residual : (n,) residuals, matched pixels.
+    pixels : (n,) disparities of the reference, matched pixels.
+    cycles : number of matched pixels over which these are spread.
+    """
+    beside = np.arange(_FIRST_BESIDE, _FIRST_BESIDE + _SINES_BESIDE) / cycles
+    frequencies = 1 + np.concatenate([[0.0], beside, -beside])
+    found = np.array([2 * abs(np.mean(residual * np.exp(-2j * np.pi * each * pixels))) for each in frequencies])
+    return float(found[0]), float(np.sqrt(np.mean(found[1:] ** 2) / 2))
+
+
+def _amplitude(
+    strength: FloatArray, count: int, noise: NoiseBounds | None, sine: tuple[float, float] | None
+) -> tuple[float, float]:
     """Estimate the amplitude of pixel locking and its standard deviation, in matched pixels.
 
-    This is a least-squares fit of amplitude and noise to the mean phasor of each multiple of the frequency. noise: bounds, in
-    matched pixels.
+    This is a least-squares fit of amplitude and noise to the mean phasor of each multiple of the frequency, and to the sine.
+
+    Parameters
+    ----------
+    strength : (4,) absolute values of the mean phasors.
+    count : number of points.
+    noise : bounds of the noise, matched pixels.
+    sine : amplitude in the residuals and its standard deviation, matched pixels. None: all noise comes after the locking.
     """
+
+    def misfit_of_noise(share: FloatArray, blur: FloatArray, noise: NoiseBounds) -> FloatArray:
+        least, most = (each[:, None] for each in noise.noise_range(share))
+        unit = _NOISE_UNCERTAINTY * noise.predicted
+        if sine is None:
+            return np.asarray((np.maximum(least - blur, 0) + np.maximum(blur - most, 0)) ** 2 / unit**2)
+        lowest, highest = (
+            share[:, None] * np.exp(-2 * np.pi**2 * np.maximum(before**2 - blur**2, 0.0)) for before in (most, least)
+        )
+        beyond = np.maximum(lowest - sine[0], 0) + np.maximum(sine[0] - highest, 0)
+        return np.asarray((np.maximum(blur - most, 0) / unit) ** 2 + (beyond / sine[1]) ** 2)
 
     def chi2(share: FloatArray, blur: FloatArray) -> FloatArray:
         harmonics = np.abs(jv(_MULTIPLES, 2 * np.pi * _MULTIPLES * share[:, None, None]))
         predicted = harmonics * np.exp(-2 * (np.pi * _MULTIPLES * blur[None, :, None]) ** 2)
         found = np.asarray(np.sum((predicted - strength) ** 2, axis=2) * 2 * count)
-        if noise is None:
-            return found
-        least, most = noise.noise_range(share)
-        beyond = np.maximum(least[:, None] - blur, 0) + np.maximum(blur - most[:, None], 0)
-        return np.asarray(found + (beyond / (_NOISE_UNCERTAINTY * noise.predicted)) ** 2)
+        return found if noise is None else found + misfit_of_noise(share, blur, noise)
 
     largest = _MOST_NOISE_PX
     shares, blurs = np.linspace(0.002, _LARGEST_AMPLITUDE, 400), np.linspace(0.0, largest, 60)
