@@ -72,6 +72,12 @@ class _SingleFit:
         log_likelihood = first.design.log_likelihood(value, estimate.candidate)
         return cls(estimate, at_points_of(found, given.part), measurement, value, kept, log_likelihood)
 
+    def is_significant(self, given: SearchInput, first: MeanSearch) -> bool:
+        """Whether the effect explains more than the best of all effects may by chance."""
+        chosen, candidate = self.estimate.chosen, self.estimate.candidate
+        linearised = first.design.log_likelihood(np.where(self.used, given.part.value, 0.0), candidate)
+        return first.p_value(chosen.score + self.log_likelihood - linearised) <= thresholds().mean.significance
+
     def improved(self, given: SearchInput, first: MeanSearch) -> _SingleFit | None:
         """Return the fit after one Gauss-Newton step from the present values; None for the reasons of `of`."""
         candidate = _recomputed(self.estimate.candidate, candidate_families(self.measurement, self.residuals))
@@ -262,13 +268,14 @@ def _strongest_single_fits(given: SearchInput, first: MeanSearch, together: list
 
 
 def _screened_single_fits(given: SearchInput, first: MeanSearch, alone: list[_SingleFit]) -> list[_SingleFit]:
-    """Add single fits of the effects that leave the least noise alone; of each effect the best one is kept, best first."""
+    """Add significant single fits of the effects that leave the least noise; of each effect the best is kept, best first."""
     sized = screen_effects(given.measurement, given.part, first.effect_variants(), _MOST_CONVERGED)
     more = [each for each in (_single_fit(given, first, item.candidate, item.values) for item in sized) if each is not None]
-    if not more:
+    refitted = [each for each in _best_variants(given, first, more) if each.is_significant(given, first)] if more else []
+    if not refitted:
         return alone
     best: dict[str, _SingleFit] = {}
-    for each in _ranked_on_common_points([*alone, *_best_variants(given, first, more)], first):
+    for each in _ranked_on_common_points([*alone, *refitted], first):
         best.setdefault(each.name, each)
     return list(best.values())
 
