@@ -127,6 +127,21 @@ def test_a_second_noise_explains_more_than_the_inexact_part_of_the_first(
     assert {each.effect for each in found} == expected
 
 
+@pytest.mark.parametrize("cycle", [1, 4])
+def test_noise_of_some_scan_lines_gets_no_name(tmp_path: Path, cycle: int) -> None:
+    """Noise that one line in four has, as if one channel were worse, is empirical; the same noise in all lines is range noise."""
+    write_scan(tmp_path, 3, step_rad=0.006)
+    _, residuals, _ = align(read_measurement(tmp_path))
+    part = residuals.part(residuals.usable)
+    noisy = part.covariates["line"] % cycle == 0
+    rng = np.random.default_rng(4)
+    value = part.sigma * np.sqrt(1.0 + noisy) * rng.standard_normal(len(part))
+    (found,), _, _ = fit_variance_model(part, WallCells.over(part.wall_xy), value, KeyedRandom(1))
+    assert found.effect == "range_noise"
+    assert found.empirical == (cycle > 1)
+    assert found.name == ("variance by line" if cycle > 1 else "range_noise")
+
+
 def test_what_a_free_form_misses_of_a_drift_gets_no_name(tmp_path: Path) -> None:
     """The ranges drift by 20 mm in the first tenth of the scan, as no effect of the catalogue does."""
     write_scan(tmp_path, 6, ranges=lambda scan: scan.R + 0.02 * np.exp(-scan.share / 0.1), step_rad=0.006)

@@ -5,7 +5,7 @@ sigma_i^2 = predicted variance + sum_k theta_k f_k(i), theta_k >= 0, for candida
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from itertools import combinations
 
@@ -27,6 +27,9 @@ _LEAST_REMAINING_VARIANCE = 0.3
 _LEAST_WHITE_SHARE, _EXPECTATION_DRAWS = 0.02, 10
 """Least share of a point's variance that counts as white noise; number of simulations of correlated noise."""
 _BINS = 8
+_LINE_DIGITS, _FEWEST_IN_LINE, _LONGEST_CYCLE = 3, 10, 16
+"""Decimals of the coordinates of image rows and columns; mean number of points in each that is needed to bin by them; longest
+cycle of lines, as of the channels of a laser scanner, in which the noise may differ."""
 _CLIP_SIGMAS = 12.0
 """Standard deviations at which outliers are clipped."""
 _HIGHEST_QUANTILE = 0.999
@@ -112,6 +115,19 @@ class VarianceTerm:
         count: number of the other points.
         """
         return replace(self, variance=np.full(count, float(self.variance.mean())))
+
+
+@dataclass(frozen=True)
+class _BinnedVariance:
+    """A variance that is free in each bin of a covariate.
+
+    name: the covariate; gain: log-likelihood ratio; score: gain minus the number of bins; added: (n,) variance that it adds.
+    """
+
+    name: str
+    gain: float
+    score: float
+    added: FloatArray
 
 
 @dataclass(frozen=True)
@@ -249,19 +265,19 @@ def fit_variance_model(
         if candidates[first].name != candidates[second].name
     ]
     pair = max(pairs, key=lambda fit: fit.score, default=best)
-    free_name, free_score, free = _best_binned_variance(squares, {name: v[used] for name, v in residuals.covariates.items()})
+    free = _best_binned_variance(squares, {name: v[used] for name, v in residuals.covariates.items()})
     # no form of a variance is exact, so a second effect or a free form must explain more than the inexact part of the first
     needed = max(by.least_gain, thresholds().mean.class_share * best.gain)
     agreement = _agreement(squares, best.added(shapes), pair.added(shapes), block)
     agreed = pair.score > best.score + needed and agreement > thresholds().edges.block_sigmas
     chosen = pair if agreed and all(float(theta.max()) > 0 for theta in pair.theta) else best
-    ahead, agreement = free_score - chosen.score, _agreement(squares, chosen.added(shapes), free, block)
+    ahead, agreement = free.score - chosen.score, _agreement(squares, chosen.added(shapes), free.added, block)
     free_fits_better = ahead > needed and agreement > thresholds().edges.least_block_sigmas
     empirical = free_fits_better and ahead > by.nonparametric_share * chosen.gain
-    note = f"the noise also varies with {free_name}, which no effect of the catalogue explains" if free_fits_better else ""
+    note = f"the noise also varies with {free.name}, which no effect of the catalogue explains" if free_fits_better else ""
     if empirical:
         chosen, note = best, ""
-    tried = sorted([*tried, VarianceScore(free_name, free_score + _BINS, free_score, True)], key=lambda item: -item.score)
+    tried = sorted([*tried, VarianceScore(free.name, free.gain, free.score, True)], key=lambda item: -item.score)
     margin = equivalence_margin(chosen.gain)
     found = []
     for place, number in enumerate(chosen.members):
@@ -274,7 +290,7 @@ def fit_variance_model(
         gain = chosen.gain - max(
             (fit.gain for fit in singles if fit.members != (number,) and fit.members[0] in chosen.members), default=0.0
         )
-        name = f"variance by {free_name}" if empirical else candidate.name
+        name = f"variance by {free.name}" if empirical else candidate.name
         found.append(
             VarianceTerm(
                 name,
@@ -451,17 +467,33 @@ def _log_likelihood_gain(squares: FloatArray, added: FloatArray) -> float:
     return float(0.5 * np.sum(squares * added / (1 + added) - np.log1p(added)))
 
 
-def _best_binned_variance(squares: FloatArray, covariates: Mapping[str, FloatArray]) -> tuple[str, float, FloatArray]:
-    """The covariate along which a variance free in each bin explains most, its score, and the variance that it adds (n,)."""
-    best: tuple[str, float, FloatArray] = ("", -np.inf, np.zeros(len(squares)))
-    for name, values in covariates.items():
-        if name in ("edge_step", "line"):
-            continue
-        edges = np.quantile(values, np.linspace(0, 1, _BINS + 1)[1:-1])
-        group = np.searchsorted(edges, values)
-        count = np.maximum(np.bincount(group, minlength=_BINS), 1)
-        variance = np.maximum(np.bincount(group, squares, _BINS) / count, 1e-9)
-        score = float(0.5 * np.sum(count * (variance - 1 - np.log(variance)))) - _BINS
-        if score > best[1]:
-            best = name, score, (variance - 1)[group]
+def _best_binned_variance(squares: FloatArray, covariates: Mapping[str, FloatArray]) -> _BinnedVariance:
+    """Return the covariate along which a variance free in each bin explains most.
+
+    Tails that are heavier than those of a normal distribution let the variances of bins differ more by chance. What the bins
+    explain beside their common mean is divided by that factor, which follows from the kurtosis.
+    """
+    mean = float(np.mean(squares))
+    tails = max(0.5 * (float(np.mean(squares**2)) / mean**2 - 1), 1.0)
+    common = 0.5 * len(squares) * (mean - 1 - np.log(mean))
+    best = _BinnedVariance("", -np.inf, -np.inf, np.zeros(len(squares)))
+    for name, group in _bins(covariates):
+        count = np.maximum(np.bincount(group), 1)
+        variance = np.maximum(np.bincount(group, squares) / count, 1e-9)
+        gain = float(common + 0.5 * np.sum(count * np.log(mean / variance)) / tails)
+        if gain - len(count) > best.score:
+            best = _BinnedVariance(name, gain, gain - len(count), (variance - 1)[group])
     return best
+
+
+def _bins(covariates: Mapping[str, FloatArray]) -> Iterator[tuple[str, NDArray[np.int64]]]:
+    """Yield (n,) bin numbers: equally filled bins of each covariate; scan lines, image rows and columns, and cycles of them."""
+    for name, values in covariates.items():
+        if name not in ("edge_step", "line"):
+            yield name, np.searchsorted(np.quantile(values, np.linspace(0, 1, _BINS + 1)[1:-1]), values)
+        if name in ("line", "image_x", "image_y"):
+            lines, group = np.unique(np.round(values, _LINE_DIGITS), return_inverse=True)
+            if 1 < len(lines) < len(values) / _FEWEST_IN_LINE:
+                yield name, group
+                number = np.rint((values - values.min()) / np.diff(lines).min()).astype(np.int64)
+                yield from ((name, number % cycle) for cycle in range(2, _LONGEST_CYCLE + 1))
