@@ -127,6 +127,25 @@ def test_a_second_noise_explains_more_than_the_inexact_part_of_the_first(
     assert {each.effect for each in found} == expected
 
 
+@pytest.mark.parametrize(("white", "oblique", "named"), [(2.0, 0.5, 2), (3.0, 0.5, 1), (5.0, 1.0, 1)])
+def test_of_two_noises_that_one_other_nearly_explains_both_are_mentioned(
+    tmp_path: Path, white: float, oblique: float, named: int
+) -> None:
+    """Range noise and noise at oblique incidence, as multiples of the predicted variance, are named or in the class."""
+    write_scan(tmp_path, 3, step_rad=0.006)
+    _, residuals, _ = align(read_measurement(tmp_path))
+    part = residuals.part(residuals.usable)
+    shapes = {each.name: each.variance.sum(axis=1) for each in variance_candidates(part)}
+    shares = {"range_noise": white, "range_noise_incidence": oblique}
+    added = sum(share * shapes[name] / shapes[name].mean() for name, share in shares.items())
+    value = np.sqrt(part.sigma**2 + float(np.median(part.sigma)) ** 2 * added) * np.random.default_rng(4).standard_normal(
+        len(part)
+    )
+    found, _, _ = fit_variance_model(part, WallCells.over(part.wall_xy), value, KeyedRandom(1))
+    assert len(found) == named
+    assert set(shares) <= {name for each in found for name in (each.effect, *each.indistinguishable)}
+
+
 @pytest.mark.parametrize("cycle", [1, 4])
 def test_noise_of_some_scan_lines_gets_no_name(tmp_path: Path, cycle: int) -> None:
     """Noise that one line in four has, as if one channel were worse, is empirical; the same noise in all lines is range noise."""

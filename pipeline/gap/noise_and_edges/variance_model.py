@@ -283,6 +283,8 @@ def fit_variance_model(
     for place, number in enumerate(chosen.members):
         candidate, theta = candidates[number], chosen.theta[place]
         others = [fit for fit in (singles if len(chosen.members) == 1 else pairs) if _replaces_only(fit, chosen, number)]
+        # two other effects that fit better, but by no more than the inexact part of one, may be the truth as well
+        others += [pair] if chosen is best and number not in pair.members and pair.score > best.score + by.least_gain else []
         near = {candidates[n].name for fit in others if fit.score > chosen.score - margin for n in fit.members}
         alike = near - {candidates[each].name for each in chosen.members}
         parameters = candidate.parameters(theta)
@@ -397,11 +399,7 @@ def _expected_mean_square(residuals: Residuals, cells: WallCells, random: KeyedR
 
 def _best_variants(tried: list[VarianceScore]) -> list[VarianceScore]:
     """Return the best score of each noise effect; some effects were tried with several values of a parameter."""
-    best: dict[str, VarianceScore] = {}
-    for item in tried:
-        if item.name not in best or item.score > best[item.name].score:
-            best[item.name] = item
-    return list(best.values())
+    return list({item.name: item for item in sorted(tried, key=lambda item: item.score)}.values())
 
 
 @dataclass(frozen=True)
