@@ -207,7 +207,12 @@ class SelectionPass:
         Edge effects are errors at depth steps, such as edge fattening. They were found before the run, which selects other
         errors.
         """
-        return {each.name for each in self.pass_input.edge_effects}
+        return _names(self.pass_input.edge_effects)
+
+
+def _names(effects: list[EdgeEffect]) -> set[str]:
+    """Names of edge effects."""
+    return {each.name for each in effects}
 
 
 @dataclass(frozen=True, eq=False)
@@ -240,17 +245,18 @@ class PassInputs:
         It is searched if a search would exclude as large a share of the points as the threshold `changes.moved_share`. The effect
         that alone makes the residuals smallest is the reason if the share is less than half as large beside it.
         """
-        excluded = self._without_effects.excluded_share
-        if excluded < thresholds().changes.moved_share:
-            return None
+        excluded, effect = self._without_effects.excluded_share, None
+        if excluded >= thresholds().changes.moved_share and (effect := self._best_single_effect) is not None:
+            beside = PassInput.of(self.measurement, self.plain, self.held_out_points, [], effect)
+            return effect if 2 * beside.excluded_share < excluded else None
+        return None
+
+    @cached_property
+    def _best_single_effect(self) -> NamedEffect | None:
+        """The effect of the catalogue that alone makes the residuals smallest; None if each would be implausibly large."""
         part = subsample(self.measurement, self.plain, np.flatnonzero(self.plain.usable & ~self._held_out))
         candidates = [each for each in catalogue_families(*part) if isinstance(each, Candidate)]
-        for estimate in screen_effects(*part, candidates, 1):
-            effect = effect_from_estimate(estimate, part[1])
-            beside = PassInput.of(self.measurement, self.plain, self.held_out_points, [], effect)
-            if 2 * beside.excluded_share < excluded:
-                return effect
-        return None
+        return next((effect_from_estimate(each, part[1]) for each in screen_effects(*part, candidates, 1)), None)
 
     @property
     def _held_out(self) -> BoolArray:
@@ -259,10 +265,18 @@ class PassInputs:
 
     @cached_property
     def edge_effects(self) -> list[EdgeEffect]:
-        """The effects at depth steps (edge effects) that the residuals show beside a large effect, if there is one."""
-        if self.large_effect is None:
-            return _find_edge_effects(self.measurement, self.plain, self.held_out_points)
-        return self._edge_effects_beside([self.large_effect], [])
+        """The effects at depth steps (edge effects) that the residuals show beside a large effect, if there is one.
+
+        A small error of the rays' directions looks like smoothing. Smoothing must therefore also show beside the effect that
+        alone makes the residuals smallest.
+        """
+        if self.large_effect is not None:
+            return self._edge_effects_beside([self.large_effect], [])
+        found = _find_edge_effects(self.measurement, self.plain, self.held_out_points)
+        if Smoothing.tag() in _names(found) and self._best_single_effect is not None:
+            beside = self._edge_effects_beside([self._best_single_effect], [])
+            return found if Smoothing.tag() in _names(beside) else beside
+        return found
 
     def edge_effects_given(self, found: SelectionPass) -> list[EdgeEffect]:
         """Search effects at depth steps (edge effects) again, with other errors in the model that can hide or imitate them.
@@ -311,7 +325,7 @@ def select_beside_edge_effects(inputs: PassInputs, random: KeyedRandom, excluded
     # a small error of the rays' directions looks like smoothing
     imitated = {Smoothing.tag()} - found.edge_effect_names
     edge_effects = [each for each in inputs.edge_effects_given(found) if each.name not in imitated]
-    if {each.name for each in edge_effects} == found.edge_effect_names:
+    if _names(edge_effects) == found.edge_effect_names:
         return found
     return SelectionPass.of(inputs.with_these(edge_effects), random, excluded)
 
