@@ -10,8 +10,15 @@ import pytest
 
 from pipeline.gap.mean.candidates import Candidate
 from pipeline.gap.mean.selection import FamilyScore, SelectedEffect
+from pipeline.gap.naming import nonlinear_refit
 from pipeline.gap.naming.named_effects import Estimate
-from pipeline.gap.naming.nonlinear_refit import _gain_over, _ranked_on_common_points, _SingleFit, _with_equivalence_class
+from pipeline.gap.naming.nonlinear_refit import (
+    _gain_over,
+    _ranked_on_common_points,
+    _search_beside_others,
+    _SingleFit,
+    _with_equivalence_class,
+)
 from pipeline.gap.naming.search_outcome import SearchOutcome
 
 CHI2: Any = SimpleNamespace(design=SimpleNamespace(log_likelihood=lambda value, _: -0.5 * float(value @ value)))
@@ -71,6 +78,30 @@ def outcome(estimates: list[Estimate], together: bool = True) -> SearchOutcome:
     """Return an explanation of residuals by some effects. together: whether one search selected all of them."""
     first = [each.chosen for each in estimates]
     return SearchOutcome(first if together else first[:1], estimates, Any, Any, [], ())  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(("further", "named"), [(1, "b"), (2, "a")])
+def test_another_fit_that_needs_fewer_further_effects_replaces_the_best(
+    monkeypatch: pytest.MonkeyPatch, further: int, named: str
+) -> None:
+    """Beside a, which fits best, two effects gain 200 each. Fit b is worse by 50, so it may belong to them; c, by 450, may not.
+
+    Effect d fits as well as b, and so belongs to its class.
+    """
+    fits = [fit(name, [float(np.sqrt(2 * worse))], [True]) for name, worse in (("a", 0), ("b", 50), ("d", 51), ("c", 450))]
+    best, tried = outcome([estimated(name) for name in "axy"], together=False), []
+
+    def beside(_: Any, chosen: SearchOutcome) -> SearchOutcome:
+        tried.append(chosen.estimates[0].candidate.name)
+        return outcome([*chosen.estimates, *(estimated(name) for name in "xy"[:further])], together=False)
+
+    monkeypatch.setattr(nonlinear_refit, "_search_beside", beside)
+    monkeypatch.setattr(nonlinear_refit, "_within_bounds", lambda *_: True)
+    given: Any = None
+    first = _search_beside_others(given, best, fits, best).estimates[0]
+    assert tried == ["b", "d"]
+    assert first.candidate.name == named
+    assert first.chosen.indistinguishable == (("d",) if named == "b" else ())
 
 
 def test_effects_of_an_explanation_keep_the_classes_of_the_linearised_search_unless_it_tells_them_apart() -> None:

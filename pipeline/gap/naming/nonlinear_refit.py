@@ -132,8 +132,12 @@ def select_and_refit(given: SearchInput, first: MeanSearch) -> SearchOutcome:
     beside_best = _search_beside_best(given, linear, alone) if alone else None
     if beside_best is None or len(beside_best.estimates) > 1:
         screened = _screened_single_fits(given, first, alone)
-        if screened and (not alone or screened[0] is not alone[0]):
+        if screened and (not alone or screened[0].estimate is not alone[0].estimate):
             beside_best = _search_beside_best(given, linear, screened) or beside_best
+        elif beside_best is not None:
+            beside_best = _with_class_of_first(beside_best, screened)
+        if beside_best is not None and len(beside_best.estimates) > 1:
+            beside_best = _search_beside_others(given, linear, screened, beside_best)
     if beside_best is not None and len(beside_best.estimates) == 1:
         return beside_best
     best = beside_best if beside_best is not None and _within_bounds(given, beside_best) else None
@@ -306,6 +310,31 @@ def _search_beside_best(given: SearchInput, plain: SearchOutcome, alone: list[_S
     """Repeat the search beside the best of some single fits."""
     estimate = _with_equivalence_class(alone).estimate
     return _search_beside(given, replace(plain, chosen=[estimate.chosen], estimates=[estimate]))
+
+
+def _with_class_of_first(found: SearchOutcome, fits: list[_SingleFit]) -> SearchOutcome:
+    """Return an explanation whose first effect is the best of some single fits, with its class among these."""
+    chosen, (first, *others) = _with_equivalence_class(fits).estimate.chosen, found.estimates
+    return replace(found, chosen=[chosen], estimates=[replace(first, chosen=chosen), *others])
+
+
+def _search_beside_others(given: SearchInput, plain: SearchOutcome, fits: list[_SingleFit], best: SearchOutcome) -> SearchOutcome:
+    """Repeat the search beside other single fits that may need fewer further effects than the best one; the simplest wins.
+
+    Such a fit is worse than the best one by less than the further effects gain, so it may be the one that belongs to them. Its
+    class holds the other fits that are as good: an error of this size is far from where the linearised search compares effects.
+    """
+    gained = sum(each.chosen.log_likelihood_ratio for each in best.estimates[1:])
+    for other in fits[1:]:
+        if fits[0].log_likelihood - other.log_likelihood > gained:
+            continue
+        margin = equivalence_margin(other.estimate.chosen.log_likelihood_ratio)
+        near = (each.name for each in fits if each is not other and abs(each.score - other.score) < margin)
+        chosen = replace(other.estimate.chosen, indistinguishable=tuple(sorted(near)))
+        found = _search_beside(given, replace(plain, chosen=[chosen], estimates=[replace(other.estimate, chosen=chosen)]))
+        if found is not None and found.complexity < best.complexity and _within_bounds(given, found):
+            best = found
+    return best
 
 
 def _with_equivalence_class(converged: list[_SingleFit]) -> _SingleFit:
