@@ -235,8 +235,8 @@ The scene is Middlebury 2014's motorcycle (741 x 500 px). OpenCV's semi-global m
 least-squares refinement. The reference is the surface of the disparities that the data set measured with structured light, cut
 where they jump by more than 1 px. The model states a nearly perfect matcher: 0.05 px of white noise and no effects.
 
-The answers find the pixel locking of the plain matcher, which the refinement removes, and the fattened edges of both. They cannot
-tell the correlated errors of a matcher from errors of the cameras. This command makes the page's results:
+The answers find the pixel locking of the plain matcher, which the refinement removes, and the fattened edges and the smoothing of
+both. This command makes the page's results:
 
     python docs/make_gap_examples.py motorcycle
 
@@ -247,14 +247,12 @@ It leaves the measurement folders and the reports in runs/gap_examples/motorcycl
 A residual is a measured minus a predicted disparity. `before` and `after` say how far the measured residuals are from those that
 the model predicts, without and with the named effects, as a distance along the line of sight
 ([how](../explanation/gap_verdict.md#the-gap)). `floor` is what the noise alone would leave, and `closed` the share of the way
-from `before` to `floor`. An effect named "as a description" describes the residuals, but is no known physical
-cause. The
-[catalogue](../reference/effects/README.md) explains the effects and their parameters; values are printed in a handy unit, such as
-mrad, whatever unit a parameter's name has.
+from `before` to `floor`. The [catalogue](../reference/effects/README.md) explains the effects and their parameters; values are
+printed in a handy unit, such as mrad, whatever unit a parameter's name has.
 
-The verdict does not follow from `closed` alone. In the first row it is `unknown` because one of the terms is only a description.
-In the second row it is `several`, because all terms are effects with a known cause and they close more than half of the gap, the
-least share that `gap` asks for.""",
+The verdict does not follow from `closed` alone. In the first row it is `unknown`, because the model with the named effects is
+still rejected and a significantly smaller gap is not shown. In the second row it is `several`, because all terms are effects with
+a known cause and they close more than half of the gap, the least share that `gap` asks for.""",
     "sgbm": """\
 This page shows what `scarpsim gap` says of a real matcher on rendered photographs, where the truth is known: the cameras are
 perfect and the surface is exact, so whatever is found is due to the matcher. It is for users of photogrammetric surfaces.
@@ -264,8 +262,8 @@ semi-global matching (`sgbm`), with and without least-squares refinement. The mo
 of white noise and no effects. Values are in pixels of the full image; a pixel of the matched pictures is 4 px of it.
 [Matching](../explanation/matching.md) has the errors of the matchers.
 
-The answers find the pixel locking of the plain matcher and the smoothing (a low-pass filter) of the refined one, and blame no
-camera. This command makes the page's results:
+The answers find the pixel locking of the plain matcher, the smoothing (a low-pass filter) of the refined one and the bias by slope
+of both, and blame no camera. This command makes the page's results:
 
     python docs/make_gap_examples.py sgbm
 
@@ -276,14 +274,11 @@ It leaves the measurement folders and the reports in runs/gap_examples/sgbm.
 A residual is a measured minus a predicted disparity. `before` and `after` say how far the measured residuals are from those that
 the model predicts, without and with the named effects, as a distance along the line of sight
 ([how](../explanation/gap_verdict.md#the-gap)). `floor` is what noise alone would leave, and `closed` is the share of the way from
-`before` to `floor`. An effect named "as a description" describes the residuals, but is no known physical
-cause. The
-[catalogue](../reference/effects/README.md) explains the effects and their parameters; values are printed in a handy unit, such as
-µrad, whatever unit a parameter's name has.
+`before` to `floor`. The [catalogue](../reference/effects/README.md) explains the effects and their parameters; values are printed
+in a handy unit, such as µrad, whatever unit a parameter's name has.
 
-The verdict does not follow from `closed` alone. In the first row it is `unknown` because one of the terms is only a description.
-In the second row it is `several`, because all terms are effects with a known cause and they close more than half of the gap, the
-least share that `gap` asks for.""",
+The verdict does not follow from `closed` alone. It is `several`, because all terms are effects with a known cause and they close
+more than half of the gap, the least share that `gap` asks for.""",
 }
 """What each page has before its table: what was evaluated, what it means, and how the table is read."""
 
