@@ -191,7 +191,7 @@ def select_effects(given: SelectionInput) -> tuple[list[NamedEffect], SelectionR
         refound, noise = _with_grid_noise(given, part, found, left, noise)
         if refound is not None:
             return select_effects(replace(given, grid_noise=refound))
-    if locking := apart.locking_for(noise):
+    if given.locking is None and (locking := apart.locking_for(noise)):
         return select_effects(replace(given, locking=locking))
     if wrong := (wrong | noise.implausible(measurement)) - given.excluded:
         again, result = select_effects(given.without(wrong))
