@@ -262,8 +262,8 @@ semi-global matching (`sgbm`), with and without least-squares refinement. The mo
 of white noise and no effects. Values are in pixels of the full image; a pixel of the matched pictures is 4 px of it.
 [Matching](../explanation/matching.md) has the errors of the matchers.
 
-The answers find the pixel locking of the plain matcher, the smoothing (a low-pass filter) of the refined one and the bias by slope
-of both, and blame no camera. This command makes the page's results:
+The answers find the pixel locking of the plain matcher, the smoothing (a low-pass filter) of the refined one and the bias by
+slope of both, and blame no camera. This command makes the page's results:
 
     python docs/make_gap_examples.py sgbm
 

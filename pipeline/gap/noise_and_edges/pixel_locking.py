@@ -139,8 +139,9 @@ def find_locking(
     """Find pixel locking: measured disparities crowd around certain fractions of a pixel. None if not significant.
 
     A disparity is converted to a phase, in which a whole pixel is 2 pi. The test statistic is R, the mean of exp(i phase) over
-    n independent points. Without locking, n |R|^2 is exponentially distributed (Rayleigh test). Points whose disparities are
-    correlated count as fewer independent ones: n is 1 over the mean of |R|^2 at frequencies that no matcher has.
+    n independent points. Without locking, n |R|^2 is exponentially distributed (Rayleigh test). Two tests must be significant: of
+    what is left of |R| beside the shape of the wall, with the number of points as n; and of |R| with 1 over the mean of |R|^2 at
+    frequencies that no matcher has as n, because correlated disparities count as fewer independent ones.
 
     Parameters
     ----------
@@ -164,8 +165,8 @@ def find_locking(
     if not found:
         return None
     best = max(found, key=lambda each: each.excess)
-    independent = _independent_points(disparities, rows, best.whole, reach)
-    p_value = min(1.0, len(_REDUCTIONS) * best.tries * float(np.exp(-independent * best.excess**2)))
+    independent, gain = _independent_points(disparities, rows, best.whole, reach), count * best.excess**2
+    p_value = min(1.0, len(_REDUCTIONS) * best.tries * float(np.exp(-min(gain, independent * best.strength**2))))
     if p_value > thresholds().locking.significance:
         return None
     frequency, turned = best.frequency, 1 + np.tan(best.tilt) * rows
@@ -179,20 +180,21 @@ def find_locking(
     share, error = _amplitude(strength, count, allowed, sine)
     first = complex(np.exp(2j * np.pi * pixels).mean())
     phase = float(np.angle(-np.conj(first) * np.sign(j1(2 * np.pi * share))))
-    return Locking(share / frequency, error / frequency, 1 / frequency, phase, best.tilt, float(count * best.excess**2))
+    return Locking(share / frequency, error / frequency, 1 / frequency, phase, best.tilt, float(gain))
 
 
 @dataclass(frozen=True)
 class _Crowding:
     """Crowding of disparities around the pixels of an image that is reduced or not.
 
-    whole: frequency of its pixels, 1/px; frequency (1/px), tilt (rad): where the disparities crowd most; excess: mean resultant
-    length of the phases, less what the shape of the wall may cause; tries: number of frequencies and tilts tried.
+    whole: frequency of its pixels, 1/px; frequency (1/px), tilt (rad): where the disparities crowd most; strength: mean resultant
+    length of the phases; excess: strength less what the shape of the wall may cause; tries: number of frequencies and tilts.
     """
 
     whole: float
     frequency: float
     tilt: float
+    strength: float
     excess: float
     tries: int
 
@@ -203,8 +205,9 @@ class _Crowding:
         _, _, of_reference = _strongest_crowding(known, tangent, whole, _SHAPE_BAND)
         shape = np.sqrt(max(of_reference.max() ** 2 - np.log(of_reference.size) / len(disparity), 0.0))
         frequency, tilt = _refine_frequency(disparity, tangent, frequency, tilt)
-        excess = _crowding(disparity, tangent, frequency, tilt) - thresholds().locking.crowding_ratio * shape
-        return cls(whole, frequency, tilt, max(excess, 0.0), strength.size)
+        found = _crowding(disparity, tangent, frequency, tilt)
+        excess = max(found - thresholds().locking.crowding_ratio * shape, 0.0)
+        return cls(whole, frequency, tilt, found, excess, strength.size)
 
 
 def _independent_points(disparity: FloatArray, tangent: FloatArray, whole: float, reach: float) -> float:
