@@ -110,8 +110,8 @@ _CAUSES = {
         "the validation blocks"
     ),
     "`light`, row_jitter": (
-        "the answer changes with the last digits of the estimated pose, because many rays hit edges of the reference, whose mesh "
-        "was made from the same pixels; with other last digits the jitter was named rightly"
+        "the data's own disagreement with their model passes for overtones of the jitter, which is 20 times their noise, and a "
+        "sine with overtones gets no name; the last digits of the estimated pose decide"
     ),
     "`matcher`": (
         "whether edge fattening is named before the injection depends on single points: with one usable point more (8,269 in "
