@@ -272,7 +272,7 @@ def _strongest_single_fits(given: SearchInput, first: MeanSearch, together: list
 
 
 def _screened_single_fits(given: SearchInput, first: MeanSearch, alone: list[_SingleFit]) -> list[_SingleFit]:
-    """Add significant single fits of the effects that leave the least noise; of each effect the best is kept, best first."""
+    """Add fits of one effect alone that leave the least noise and are significant; of each effect the best is kept, best first."""
     sized = screen_effects(given.measurement, given.part, first.effect_variants(), _MOST_CONVERGED)
     more = [each for each in (_single_fit(given, first, item.candidate, item.values) for item in sized) if each is not None]
     refitted = [each for each in _best_variants(given, first, more) if each.is_significant(given, first)] if more else []
@@ -319,7 +319,7 @@ def _with_class_of_first(found: SearchOutcome, fits: list[_SingleFit]) -> Search
 
 
 def _search_beside_others(given: SearchInput, plain: SearchOutcome, fits: list[_SingleFit], best: SearchOutcome) -> SearchOutcome:
-    """Repeat the search beside other single fits that may need fewer further effects than the best one; the simplest wins.
+    """Repeat the search beside other effects that were refitted alone and may need fewer further ones; the simplest answer wins.
 
     Such a fit is worse than the best one by less than the further effects gain, so it may be the one that belongs to them. Its
     class holds the other fits that are as good: an error of this size is far from where the linearised search compares effects.

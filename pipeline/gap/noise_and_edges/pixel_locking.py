@@ -4,7 +4,7 @@ If d' = x + A sin(2 pi x / n + phase) and x is distributed over many pixels, the
 exp(-i phase) (Jacobi-Anger). This also holds where noise in x would average the sine away in the residuals. The k-th multiple of
 the angle gives |Jk(2 pi k A / n)|. Noise of standard deviation s after the locking multiplies it by exp(-2 (pi k s / n)^2).
 
-The residuals show the sine over the reference's disparities. There, noise before the locking and errors of the reference, of
+Residuals, plotted over the reference's disparities, show the sine. There, noise before the locking and errors of the reference, of
 standard deviation t together, multiply its amplitude by exp(-2 (pi t / n)^2). With the variance of the residuals,
 s^2 + t^2 + A^2 / 2, this tells a small amplitude from a large one that is hidden by noise, whichever comes first.
 
@@ -32,7 +32,8 @@ rad."""
 _SHAPE_BAND = 0.18
 """Relative half-width of the band around the pixel frequency in which crowding of the reference counts as the wall's shape."""
 _BAND_BESIDE = 0.4
-"""The same of the band in which crowding of measured disparities shows how many of the points are independent."""
+"""Relative half-width of the band around the pixel frequency in which the crowding of measured disparities shows how many points
+are independent."""
 _BINS_A_CYCLE, _STEPS_A_CYCLE = 8, 4
 """Bins and trial frequencies for each cycle."""
 _MOST_BINS = 4096
