@@ -272,7 +272,7 @@ def _strongest_single_fits(given: SearchInput, first: MeanSearch, together: list
 
 
 def _screened_single_fits(given: SearchInput, first: MeanSearch, alone: list[_SingleFit]) -> list[_SingleFit]:
-    """Add fits of one effect alone that leave the least noise and are significant; of each effect the best is kept, best first."""
+    """Add fits of one effect alone that leave the least noise and are significant; of each effect the best one, best first."""
     sized = screen_effects(given.measurement, given.part, first.effect_variants(), _MOST_CONVERGED)
     more = [each for each in (_single_fit(given, first, item.candidate, item.values) for item in sized) if each is not None]
     refitted = [each for each in _best_variants(given, first, more) if each.is_significant(given, first)] if more else []

@@ -4,8 +4,8 @@ If d' = x + A sin(2 pi x / n + phase) and x is distributed over many pixels, the
 exp(-i phase) (Jacobi-Anger). This also holds where noise in x would average the sine away in the residuals. The k-th multiple of
 the angle gives |Jk(2 pi k A / n)|. Noise of standard deviation s after the locking multiplies it by exp(-2 (pi k s / n)^2).
 
-Residuals, plotted over the reference's disparities, show the sine. There, noise before the locking and errors of the reference, of
-standard deviation t together, multiply its amplitude by exp(-2 (pi t / n)^2). With the variance of the residuals,
+Residuals, plotted over the reference's disparities, show the sine. There, noise before the locking and errors of the reference,
+of standard deviation t together, multiply its amplitude by exp(-2 (pi t / n)^2). With the variance of the residuals,
 s^2 + t^2 + A^2 / 2, this tells a small amplitude from a large one that is hidden by noise, whichever comes first.
 
 The rectification in which the disparities were matched is not part of a measurement. Another rectification has another principal
