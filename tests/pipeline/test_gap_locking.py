@@ -111,7 +111,7 @@ def test_a_matcher_whose_rectification_is_turned_about_the_base_is_seen_through(
 def test_amplitude_is_found_whether_noise_comes_before_or_after_the_locking(
     amplitude: float, before: float, after: float
 ) -> None:
-    """The amplitude is within three standard deviations and a fifth of the truth, in matched pixels of two pixels each."""
+    """The amplitude found is within three standard deviations of the truth. The matcher worked in an image of half the size."""
     random = np.random.default_rng(7)
     surface = random.uniform(100, 160, 20_000)
     x = surface + before * random.standard_normal(20_000)

@@ -73,7 +73,7 @@ class _SingleFit:
         return cls(estimate, at_points_of(found, given.part), measurement, value, kept, log_likelihood)
 
     def is_significant(self, given: SearchInput, first: MeanSearch) -> bool:
-        """Whether the effect explains more than the best of all effects may by chance."""
+        """Tell whether the effect explains the residuals better than the best of all effects would if there were none."""
         chosen, candidate = self.estimate.chosen, self.estimate.candidate
         linearised = first.design.log_likelihood(np.where(self.used, given.part.value, 0.0), candidate)
         return first.p_value(chosen.score + self.log_likelihood - linearised) <= thresholds().mean.significance

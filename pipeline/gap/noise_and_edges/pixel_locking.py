@@ -186,7 +186,7 @@ def find_locking(
 
 @dataclass(frozen=True)
 class _Crowding:
-    """Crowding of disparities around the pixels of an image that is reduced or not.
+    """How strongly disparities crowd around whole pixels, of the full image or of a smaller one in which the matcher worked.
 
     whole: frequency of its pixels, 1/px; frequency (1/px), tilt (rad): where the disparities crowd most; strength: mean resultant
     length of the phases; excess: strength less what the shape of the wall may cause; tries: number of frequencies and tilts.

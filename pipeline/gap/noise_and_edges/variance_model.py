@@ -119,7 +119,7 @@ class VarianceTerm:
 
 @dataclass(frozen=True)
 class _BinnedVariance:
-    """A variance that is free in each bin of a covariate.
+    """A noise variance that is fitted separately in each bin of a covariate.
 
     name: the covariate; gain: log-likelihood ratio; score: gain minus the number of bins; added: (n,) variance that it adds.
     """
