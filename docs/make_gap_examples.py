@@ -251,8 +251,8 @@ from `before` to `floor`. The [catalogue](../reference/effects/README.md) explai
 printed in a handy unit, such as mrad, whatever unit a parameter's name has.
 
 The verdict does not follow from `closed` alone. In the first row it is `unknown`, because the model with the named effects is
-still rejected, and validation blocks do not show that the gap is smaller. In the second row it is `several`, because all terms are effects with
-a known cause and they close more than half of the gap, the least share that `gap` asks for.""",
+still rejected, and validation blocks do not show that the gap is smaller. In the second row it is `several`, because all terms
+are effects with a known cause and they close more than half of the gap, the least share that `gap` asks for.""",
     "sgbm": """\
 This page shows what `scarpsim gap` says of a real matcher on rendered photographs, where the truth is known: the cameras are
 perfect and the surface is exact, so whatever is found is due to the matcher. It is for users of photogrammetric surfaces.
