@@ -24,7 +24,7 @@ from documents import write_between
 
 from pipeline.formats.measurements.measurement import FILE, read_measurement
 from pipeline.gap.mean.search import MeanSearch
-from pipeline.gap.naming import effect_selection, nonlinear_refit, selection_passes, workflow
+from pipeline.gap.naming import effect_selection, nonlinear_refit, search_beside_effects, selection_passes, workflow
 from pipeline.gap.naming.validation import Validation
 
 MOST_ROWS, MOST_PARTS = 10, 3
@@ -32,10 +32,14 @@ DOCUMENT = Path(__file__).parents[1] / "docs" / "validation" / "gap.md"
 MARKS = ("<!-- cost -->", "<!-- end of cost -->")
 PARTS: dict[str, list[tuple[Any, str]]] = {
     "first residuals and pose": [(workflow, "compute_residuals"), (workflow, "align")],
-    "residuals beside effects": [(nonlinear_refit, "_aligned_with_estimates"), (selection_passes, "aligned_with")],
+    "residuals beside effects": [
+        (nonlinear_refit, "aligned_with_estimates"),
+        (search_beside_effects, "aligned_with_estimates"),
+        (selection_passes, "aligned_with"),
+    ],
     "edge effects": [(selection_passes, "_find_edge_effects"), (selection_passes, "_with_effects")],
     "scene changes": [(selection_passes, "find_scene_changes")],
-    "signatures": [(effect_selection, "candidate_families"), (nonlinear_refit, "candidate_families")],
+    "signatures": [(module, "candidate_families") for module in (effect_selection, nonlinear_refit, search_beside_effects)],
     "search: design and null": [(MeanSearch, "__init__")],
     "search: selection": [(MeanSearch, "select")],
     "refits": [(nonlinear_refit, name) for name in ("_strongest_single_fits", "_screened_single_fits", "search_at_joint_fit")],

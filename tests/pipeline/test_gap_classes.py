@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
 
@@ -14,6 +15,7 @@ from pipeline.gap.naming import nonlinear_refit
 from pipeline.gap.naming.named_effects import Estimate
 from pipeline.gap.naming.nonlinear_refit import (
     _gain_over,
+    _JointFit,
     _ranked_on_common_points,
     _search_beside_others,
     _SingleFit,
@@ -80,13 +82,14 @@ def outcome(estimates: list[Estimate], together: bool = True) -> SearchOutcome:
     return SearchOutcome(first if together else first[:1], estimates, Any, Any, [], ())  # type: ignore[arg-type]
 
 
-@pytest.mark.parametrize(("further", "named"), [(1, "b"), (2, "a")])
+@pytest.mark.parametrize(("further", "named", "alike"), [(1, "b", ("d",)), (2, "a", ("b",)), (0, "d", ("b",))])
 def test_another_fit_that_needs_fewer_further_effects_replaces_the_best(
-    monkeypatch: pytest.MonkeyPatch, further: int, named: str
+    monkeypatch: pytest.MonkeyPatch, further: int, named: str, alike: tuple[str, ...]
 ) -> None:
     """Beside a, which fits best, two effects gain 200 each. Fit b is worse by 50, so it may belong to them; c, by 450, may not.
 
-    Effect d fits as well as b, and so belongs to its class.
+    Effect d fits as well as b, and so belongs to its class. Fitted together with the further effects, b is worse than a by 2
+    and d by 8, so b is an alternative to a. If b and d need none of them, d wins, which is then better by 8.
     """
     fits = [fit(name, [float(np.sqrt(2 * worse))], [True]) for name, worse in (("a", 0), ("b", 50), ("d", 51), ("c", 450))]
     best, tried = outcome([estimated(name) for name in "axy"], together=False), []
@@ -95,13 +98,18 @@ def test_another_fit_that_needs_fewer_further_effects_replaces_the_best(
         tried.append(chosen.estimates[0].candidate.name)
         return outcome([*chosen.estimates, *(estimated(name) for name in "xy"[:further])], together=False)
 
+    def joint_fit(_: Any, found: SearchOutcome) -> _JointFit:
+        worse = {"a": 0, "b": 2 if further else 16, "d": 8}[found.estimates[0].candidate.name]
+        return _JointFit(found, [], np.array([np.sqrt(2.0 * worse)]), np.array([True]))
+
     monkeypatch.setattr(nonlinear_refit, "_search_beside", beside)
     monkeypatch.setattr(nonlinear_refit, "_within_bounds", lambda *_: True)
+    monkeypatch.setattr(_JointFit, "of", joint_fit)
     given: Any = None
-    first = _search_beside_others(given, best, fits, best).estimates[0]
+    first = _search_beside_others(given, replace(best, search=CHI2), fits, best).estimates[0]
     assert tried == ["b", "d"]
     assert first.candidate.name == named
-    assert first.chosen.indistinguishable == (("d",) if named == "b" else ())
+    assert first.chosen.indistinguishable == alike
 
 
 def test_effects_of_an_explanation_keep_the_classes_of_the_linearised_search_unless_it_tells_them_apart() -> None:

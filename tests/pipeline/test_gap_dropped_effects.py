@@ -10,7 +10,7 @@ from gap_cases import Array, Scan, write_scan
 
 from pipeline.formats.measurements.measurement import Measurement, read_measurement
 from pipeline.gap.mean.candidates import Candidate, SineGrid
-from pipeline.gap.naming import effect_selection, nonlinear_refit
+from pipeline.gap.naming import effect_selection, search_beside_effects
 from pipeline.gap.naming.candidate_families import candidate_families
 from pipeline.gap.residuals.alignment import align, fit_pose_robustly
 from pipeline.gap.residuals.residuals import Residuals
@@ -31,7 +31,7 @@ def _few(measurement: Measurement, part: Residuals) -> list[Candidate | SineGrid
 def test_what_one_of_two_true_effects_leaves_is_significant(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     write_scan(tmp_path, 5, step_rad=0.009, ranges=_ranges)
     monkeypatch.setattr(effect_selection, "candidate_families", _few)
-    monkeypatch.setattr(nonlinear_refit, "candidate_families", _few)
+    monkeypatch.setattr(search_beside_effects, "candidate_families", _few)
     there, residuals, _ = align(read_measurement(tmp_path))
     part = residuals.part(residuals.usable)
     named, result = effect_selection.select_effects(

@@ -29,10 +29,9 @@ from pipeline.gap.naming.nonlinear_refit import (
     _screened_single_fits,
     _strongest_single_fits,
     _with_equivalence_class,
-    fit_jointly,
-    search_at_joint_fit,
     select_and_refit,
 )
+from pipeline.gap.naming.search_beside_effects import fit_jointly, search_at_joint_fit
 from pipeline.gap.naming.search_outcome import SearchInput, SearchOutcome
 from pipeline.gap.naming.search_residuals import with_fitted_variance
 from pipeline.gap.naming.selection_passes import PassInput, PassInputs
@@ -194,7 +193,7 @@ def test_slopes_do_not_serve_where_what_they_miss_is_as_much_as_something_gains(
     one, two = (
         abs(
             leading.log_likelihood
-            - first.design.log_likelihood(np.where(used, points.part.value, 0.0), leading.estimate.candidate)
+            - first.design.log_likelihood(np.where(used, points.part.value, 0.0), [leading.estimate.candidate])
         )
         for used in (leading.used, np.ones_like(leading.used))
     )

@@ -261,17 +261,17 @@ class Design:
         """
         return [*self.pose_columns, *(column for each in candidates for column in self.column_numbers[each])]
 
-    def log_likelihood(self, value: FloatArray, candidate: Candidate) -> float:
-        """Return the log-likelihood of other residuals of the same points, with the pose and one candidate error fitted.
+    def log_likelihood(self, value: FloatArray, candidates: list[Candidate]) -> float:
+        """Return the log-likelihood of other residuals of the same points, with the pose and some candidate errors fitted.
 
-        It tells whether residuals become more likely when an effect is refitted without linearisation.
+        It tells whether residuals become more likely when effects are refitted without linearisation.
 
         Parameters
         ----------
         value : (n,) the other residuals, in the unit of the observable (m, or px of disparity).
-        candidate : The candidate error.
+        candidates : The candidate errors.
         """
-        columns = self._projected_pose.append(self.model.project(_projected(self.pose_basis, self._matrix([candidate], None))))
+        columns = self._projected_pose.append(self.model.project(_projected(self.pose_basis, self._matrix(candidates, None))))
         projected = self.model.project(value[self.model.rows, None] * self.model.inverse_sigma[:, None])
         return fit_reml(self.model.covariances, columns, projected).log_likelihood
 

@@ -31,7 +31,8 @@ from pipeline.gap.naming.named_effects import (
     out_of_bounds,
     within_bounds,
 )
-from pipeline.gap.naming.nonlinear_refit import repeat_search, select_and_refit
+from pipeline.gap.naming.nonlinear_refit import select_and_refit
+from pipeline.gap.naming.search_beside_effects import repeat_search
 from pipeline.gap.naming.search_outcome import SearchInput, SearchOutcome
 from pipeline.gap.naming.search_residuals import with_added_variance, with_fitted_variance
 from pipeline.gap.noise_and_edges.grid_noise import find_grid_noise, separate_white_and_grid_noise
