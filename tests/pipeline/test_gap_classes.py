@@ -14,8 +14,8 @@ from pipeline.gap.mean.selection import FamilyScore, SelectedEffect
 from pipeline.gap.naming import nonlinear_refit
 from pipeline.gap.naming.named_effects import Estimate
 from pipeline.gap.naming.nonlinear_refit import (
+    _ExplanationFit,
     _gain_over,
-    _JointFit,
     _ranked_on_common_points,
     _search_beside_others,
     _SingleFit,
@@ -98,13 +98,13 @@ def test_another_fit_that_needs_fewer_further_effects_replaces_the_best(
         tried.append(chosen.estimates[0].candidate.name)
         return outcome([*chosen.estimates, *(estimated(name) for name in "xy"[:further])], together=False)
 
-    def joint_fit(_: Any, found: SearchOutcome) -> _JointFit:
+    def joint_fit(_: Any, found: SearchOutcome) -> _ExplanationFit:
         worse = {"a": 0, "b": 2 if further else 16, "d": 8}[found.estimates[0].candidate.name]
-        return _JointFit(found, [], np.array([np.sqrt(2.0 * worse)]), np.array([True]))
+        return _ExplanationFit(found, [], np.array([np.sqrt(2.0 * worse)]), np.array([True]))
 
     monkeypatch.setattr(nonlinear_refit, "_search_beside", beside)
     monkeypatch.setattr(nonlinear_refit, "_within_bounds", lambda *_: True)
-    monkeypatch.setattr(_JointFit, "of", joint_fit)
+    monkeypatch.setattr(_ExplanationFit, "of", joint_fit)
     given: Any = None
     first = _search_beside_others(given, replace(best, search=CHI2), fits, best).estimates[0]
     assert tried == ["b", "d"]

@@ -87,8 +87,8 @@ class _SingleFit:
 
 
 @dataclass(frozen=True)
-class _JointFit:
-    """All effects of an explanation, fitted together without linearising.
+class _ExplanationFit:
+    """One explanation, with all its effects fitted together without linearising.
 
     found: the explanation; candidates: its effects as regression terms; value, used: as of a `_SingleFit`.
     """
@@ -99,7 +99,7 @@ class _JointFit:
     used: BoolArray
 
     @classmethod
-    def of(cls, given: SearchInput, found: SearchOutcome) -> _JointFit | None:
+    def of(cls, given: SearchInput, found: SearchOutcome) -> _ExplanationFit | None:
         """Fit the effects; None if one is an empirical term or out of bounds, or if too few rays meet the reference."""
         if any(each.candidate.empirical for each in found.estimates):
             return None
@@ -295,7 +295,7 @@ def _most_likely(given: SearchInput, first: MeanSearch, found: list[SearchOutcom
     enters the class of the one in its place.
     """
     different = {frozenset(_names(each)): each for each in reversed(found)}.values()
-    fits = [fit for each in different if (fit := _JointFit.of(given, each)) is not None]
+    fits = [fit for each in different if (fit := _ExplanationFit.of(given, each)) is not None]
     if len(fits) < 2:
         return found[0]
     common = np.all([each.used for each in fits], axis=0)
