@@ -48,7 +48,7 @@ from pipeline.gap.noise_and_edges.missing_returns import (
     explain_missing_returns,
 )
 from pipeline.gap.noise_and_edges.variance_model import VarianceScore
-from pipeline.gap.residuals.alignment import AlignedMeasurement, align, compute_residuals, fit_pose_robustly
+from pipeline.gap.residuals.alignment import align, compute_residuals, fit_pose_robustly
 from pipeline.gap.residuals.residuals import BoolArray, Residuals
 from pipeline.gap.residuals.scene_changes import SceneChange, moved_share
 from pipeline.gap.residuals.sensor_view import SensorView
@@ -165,36 +165,14 @@ def diagnose(
 
 def _diagnose(measurement: Measurement, clock: _Clock, random: KeyedRandom) -> GapDiagnosis:
     """Run the steps of the workflow on the subsampled measurement."""
-    measurement.check_near(FILE)
-    initial = compute_residuals(measurement)
-    check_noise("surface" if isinstance(initial, SurfaceResiduals) else initial.sensor, initial.sigma)
-    held_out_points = np.zeros(len(measurement.cloud.points), dtype=bool)
-    held_out_points[initial.index] = in_validation_blocks(initial.wall_xy, WallCells.over(initial.wall_xy).side_m)
-    held_out_points |= _in_validation_epoch(measurement.epochs)
-    aligned, plain, surveyed = align(measurement, initial.index[~held_out_points[initial.index]], initial)
-    if isinstance(measurement, StereoMeasurement) and isinstance(initial, StereoResiduals):
-        trusted = initial.index[~held_out_points[initial.index]]
-        found = AlignedMeasurement(aligned, plain, surveyed)
-        aligned, plain, surveyed = align_beside_fattening(measurement, initial, found, trusted)
-    if isinstance(aligned, StereoMeasurement) and isinstance(plain, StereoResiduals):
-        aligned = with_surroundings(aligned, plain)
-    if isinstance(aligned, TlsMeasurement) and isinstance(plain, TlsResiduals):
-        plain = replace(plain, expected_pulses=find_expected_pulses(aligned, plain))
+    aligned, plain, surveyed, held_out_points = _aligned(measurement)
     clock.lap("residuals")
     if plain.usable.sum() < thresholds().points.fewest:
         return _insufficient_data(measurement, plain, clock)
     inputs = PassInputs(aligned, plain, held_out_points)
     validated = _select_and_validate(inputs, random)
     clock.lap("naming")
-    validation = _validation(aligned, plain, validated, random)
-    result, harmful = validation.validate(validated.named)
-    if _empirical(validated.named, but_not=result.named) and _nameable(inputs):
-        again = _select_and_validate(inputs, random, frozenset({NONPARAMETRIC_TERMS}))
-        validation_again = _validation(aligned, plain, again, random)
-        result_again, harmful_again = validation_again.validate(again.named)
-        if result_again.named:
-            validated, validation, result = again, validation_again, result_again
-            harmful = [*harmful, *harmful_again]
+    validated, validation, result, harmful = _with_gap(inputs, validated, random)
     given, selection = validated.given, validated.selection
     notes = [
         *selection.notes,
@@ -202,15 +180,7 @@ def _diagnose(measurement: Measurement, clock: _Clock, random: KeyedRandom) -> G
         *validated.words,
         *harmful,
     ]
-    outlier_share = validated.tails.share if validated.tails is not None and validated.tails.uniform else 0.0
-    overdispersion = 1.0 if any(item.adds_variance for item in result.named) else selection.unexplained_noise.value
-    evidence = Evidence(
-        result.gap,
-        selection.p_value_given(result.named),
-        selection.unexplained_noise.at_most_one,
-        outlier_share,
-        overdispersion=overdispersion,
-    )
+    evidence = _evidence(validated, result)
     notes = [*notes, *note_overdispersion(evidence, notes)]
     evidence = _with_moved_share(evidence, aligned, given, result)
     if evidence.much_moved:
@@ -241,11 +211,71 @@ def _diagnose(measurement: Measurement, clock: _Clock, random: KeyedRandom) -> G
     )
 
 
-def _validation(aligned: Measurement, plain: Residuals, validated: _ValidatedSelection, random: KeyedRandom) -> Validation:
-    """Prepare the scores on the validation points of a selection; plain: residuals without edge effects."""
-    given, selection = validated.given, validated.selection
+def _aligned(measurement: Measurement) -> tuple[Measurement, Residuals, FloatArray, BoolArray]:
+    """Estimate the pose and compute the residuals.
+
+    Returns
+    -------
+    The measurement at that pose, its residuals, the pose, and the (N,) points of the measurement that are kept for validation.
+    """
+    measurement.check_near(FILE)
+    initial = compute_residuals(measurement)
+    check_noise("surface" if isinstance(initial, SurfaceResiduals) else initial.sensor, initial.sigma)
+    held_out_points = np.zeros(len(measurement.cloud.points), dtype=bool)
+    held_out_points[initial.index] = in_validation_blocks(initial.wall_xy, WallCells.over(initial.wall_xy).side_m)
+    held_out_points |= _in_validation_epoch(measurement.epochs)
+    trusted = initial.index[~held_out_points[initial.index]]
+    found = align(measurement, trusted, initial)
+    if isinstance(measurement, StereoMeasurement) and isinstance(initial, StereoResiduals):
+        found = align_beside_fattening(measurement, initial, found, trusted)
+    aligned, plain, pose = found
+    if isinstance(aligned, StereoMeasurement) and isinstance(plain, StereoResiduals):
+        aligned = with_surroundings(aligned, plain)
+    if isinstance(aligned, TlsMeasurement) and isinstance(plain, TlsResiduals):
+        plain = replace(plain, expected_pulses=find_expected_pulses(aligned, plain))
+    return aligned, plain, pose, held_out_points
+
+
+def _with_gap(
+    inputs: PassInputs, validated: _ValidatedSelection, random: KeyedRandom
+) -> tuple[_ValidatedSelection, Validation, ValidationResult, list[str]]:
+    """Measure the gap without and with the effects of a selection.
+
+    If an empirical term does not close the gap, the selection is repeated without empirical terms.
+
+    Returns
+    -------
+    The selection that counts, the preparation of its scores, the scores, and notes on effects that widen the gap.
+    """
+    validation = _validation(inputs, validated, random)
+    result, harmful = validation.validate(validated.named)
+    if _empirical(validated.named, but_not=result.named) and _nameable(inputs):
+        again = _select_and_validate(inputs, random, frozenset({NONPARAMETRIC_TERMS}))
+        validation_again = _validation(inputs, again, random)
+        result_again, harmful_again = validation_again.validate(again.named)
+        if result_again.named:
+            return again, validation_again, result_again, [*harmful, *harmful_again]
+    return validated, validation, result, harmful
+
+
+def _evidence(validated: _ValidatedSelection, result: ValidationResult) -> Evidence:
+    """Return the numbers that decide the verdict, but for the share of the wall that moved."""
+    noise, tails = validated.selection.unexplained_noise, validated.tails
+    return Evidence(
+        result.gap,
+        validated.selection.p_value_given(result.named),
+        noise.at_most_one,
+        tails.share if tails is not None and tails.uniform else 0.0,
+        overdispersion=1.0 if any(item.adds_variance for item in result.named) else noise.value,
+    )
+
+
+def _validation(inputs: PassInputs, validated: _ValidatedSelection, random: KeyedRandom) -> Validation:
+    """Prepare the scores on the validation points of a selection."""
+    given, selection, plain = validated.given, validated.selection, inputs.plain
+    share = _share_of_model_noise(selection.unexplained_noise.at_most_one, plain)
     return Validation(
-        measurement=aligned,
+        measurement=inputs.measurement,
         residuals=plain,
         registration_rows=given.training_rows,
         tested=given.measurable & given.held_out,
@@ -254,7 +284,7 @@ def _validation(aligned: Measurement, plain: Residuals, validated: _ValidatedSel
         reference_sigma=selection.reference_sigma,
         most_sigmas=thresholds().points.outlier_sigmas * given.noise_ratio,
         random=random,
-        reduced_noise=reduced_noise(aligned.model, _share_of_model_noise(selection.unexplained_noise.at_most_one, plain)),
+        reduced_noise=reduced_noise(inputs.measurement.model, share),
     )
 
 

@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 from pipeline.change.robust import nmad
 from pipeline.gap.mean.detection_power import DetectableSize
 from pipeline.gap.noise_and_edges.sign_flips import null_critical_score
-from pipeline.gap.noise_and_edges.variance_model import VarianceCandidate, standardised_deviations, variance_candidates
+from pipeline.gap.noise_and_edges.variance_fit import VarianceCandidate
+from pipeline.gap.noise_and_edges.variance_model import standardised_deviations, variance_candidates
 from pipeline.gap.residuals.residuals import Residuals
 from pipeline.gap.residuals.wall_blocks import WallCells, wall_block_numbers
 from pipeline.gap.thresholds import thresholds

@@ -5,8 +5,7 @@ sigma_i^2 = predicted variance + sum_k theta_k f_k(i), theta_k >= 0, for candida
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from itertools import combinations
 
 import numpy as np
@@ -15,6 +14,7 @@ from scipy.spatial import cKDTree
 
 from pipeline.change.robust import nmad
 from pipeline.gap.noise_and_edges.sign_flips import null_p_value
+from pipeline.gap.noise_and_edges.variance_fit import BinnedVariance, VarianceCandidate, VarianceFit, best_binned_variance
 from pipeline.gap.residuals.residuals import BoolArray, Geometry, Residuals
 from pipeline.gap.residuals.wall_blocks import WallCells, wall_block_numbers
 from pipeline.gap.thresholds import equivalence_margin, thresholds
@@ -26,61 +26,10 @@ _LEAST_REMAINING_VARIANCE = 0.3
 """Least share of a point's variance that the plane of its cell must leave."""
 _LEAST_WHITE_SHARE, _EXPECTATION_DRAWS = 0.02, 10
 """Least share of a point's variance that counts as white noise; number of simulations of correlated noise."""
-_BINS = 8
-_LINE_DIGITS, _FEWEST_IN_LINE, _LONGEST_CYCLE = 3, 10, 16
-"""Decimals of the coordinates of image rows and columns; mean number of points in each that is needed to bin by them; longest
-cycle of lines, as of the channels of a laser scanner, in which the noise may differ."""
 _CLIP_SIGMAS = 12.0
 """Standard deviations at which outliers are clipped."""
 _HIGHEST_QUANTILE = 0.999
 """Quantile of a candidate's variance above which it is clipped."""
-_FISHER_ROUNDS = 25
-
-
-@dataclass(frozen=True)
-class VarianceCandidate:
-    """A noise effect to fit: the variance that it adds at each of n points, as a sum of k fitted terms, one for each parameter.
-
-    A fitted factor theta multiplies the variance that a parameter adds at its typical size (1: typical size).
-
-    Attributes
-    ----------
-    name : name of the effect.
-    variance : (n, k) variance that each parameter adds at its typical size, squared unit of the observable (m² or px²).
-    scale : (k,) typical sizes; the value of a parameter is scale * sqrt(theta).
-    names : (k,) names of the parameters.
-    cost : penalty subtracted from the log-likelihood ratio: the number of parameters, with those in `fixed`.
-    fixed : values, by name, of parameters that are not fitted; each of a few trial values makes a candidate of its own.
-    """
-
-    name: str
-    variance: FloatArray
-    scale: tuple[float, ...]
-    names: tuple[str, ...]
-    cost: float = 1.0
-    fixed: Mapping[str, float] = field(default_factory=dict)
-
-    def parameters(self, theta: FloatArray) -> dict[str, float]:
-        """Convert fitted factors of the variance to values of the noise effect's parameters, by name.
-
-        theta: (k,) factors; 1 is the variance at a parameter's typical size.
-        """
-        return dict(zip(self.names, map(float, np.sqrt(theta) * np.array(self.scale)), strict=True)) | dict(self.fixed)
-
-    def standard_deviations(self, theta: FloatArray, error: FloatArray) -> dict[str, float]:
-        """Return the standard deviations of a noise effect's parameters by name.
-
-        They follow from those of the fitted factors of the variance. If a factor is below its standard deviation, the parameter
-        may be 0; the returned value is then the size at which the factor equals its standard deviation.
-
-        Parameters
-        ----------
-        theta : (k,) fitted factors of the variance; 1 is the variance at a parameter's typical size.
-        error : (k,) standard deviations of theta.
-        """
-        root = np.sqrt(theta)
-        std = np.where(theta > error, error / np.maximum(2 * root, 1e-300), np.sqrt(error))
-        return dict(zip(self.names, map(float, std * np.array(self.scale)), strict=True))
 
 
 @dataclass(frozen=True)
@@ -115,19 +64,6 @@ class VarianceTerm:
         count: number of the other points.
         """
         return replace(self, variance=np.full(count, float(self.variance.mean())))
-
-
-@dataclass(frozen=True)
-class _BinnedVariance:
-    """A noise variance that is fitted separately in each bin of a covariate.
-
-    name: the covariate; gain: log-likelihood ratio; score: gain minus the number of bins; added: (n,) variance that it adds.
-    """
-
-    name: str
-    gain: float
-    score: float
-    added: FloatArray
 
 
 @dataclass(frozen=True)
@@ -231,82 +167,147 @@ def fit_variance_model(
     tuple : the noise terms; the scores of all candidates, best first; and a note on variance that no effect explains, or "".
     """
     candidates = [each for each in variance_candidates(residuals) if each.name not in excluded]
-    if not candidates:
+    seen = _SquaredDeviations.of(residuals, cells, value, candidates, random) if candidates else None
+    if seen is None:
         return [], [], ""
-    weighted, predicted = residuals, residuals.sigma**2 * _expected_mean_square(residuals, cells, random)
-    for first_round in (True, False):
-        # in the second round points have the weight of their fitted noise, as noisy points would shift the plane of their cell
-        z = standardised_deviations(weighted, cells, value)
-        if not np.isfinite(z).any():  # no cell has enough points for a plane and a deviation from it
-            return [], [], ""
-        used = np.isfinite(z) & (np.abs(z) < thresholds().points.outlier_sigmas * max(1.0, nmad(z, 0.0)))
-        squares = (z * weighted.sigma)[used] ** 2 / predicted[used]
-        shapes = [candidate.variance[used] / predicted[used, None] for candidate in candidates]
-        singles = [_JointFit.fitted(squares, shapes, [number], candidates) for number in range(len(shapes))]
-        best = max(singles, key=lambda fit: fit.score)
-        if first_round:
-            added = candidates[best.members[0]].variance @ best.theta[0]
-            weighted = replace(residuals, sigma=np.sqrt(residuals.sigma**2 + added))
-    excess = float(np.mean(best.added(shapes)))
-    block = wall_block_numbers(residuals.wall_xy[used], cells.side_m)
-    p_value = null_p_value(squares, [shape.sum(axis=1) for shape in shapes], block, random)
-    tried = [VarianceScore(c.name, fit.gain, fit.score) for c, fit in zip(candidates, singles, strict=True)]
-    tried = sorted(_best_variants(tried), key=lambda item: -item.score)
     by = thresholds().variance
-    if best.gain < by.least_gain or p_value > thresholds().mean.significance or excess < by.least_excess:
+    best, tried = seen.best, seen.scores()
+    added = best.added(seen.shapes)
+    p_value = null_p_value(seen.squares, [shape.sum(axis=1) for shape in seen.shapes], seen.block, random)
+    if best.gain < by.least_gain or p_value > thresholds().mean.significance or added.mean() < by.least_excess:
         return [], tried, ""
     # for disparities `grid_noise` compares neighbours, because grid-correlated noise moves them alike too
-    unshared = _unshared_share(residuals, value, used, best.added(shapes)) if residuals.sensor == "tls" else 1.0
+    unshared = _unshared_share(residuals, value, seen.used, added) if residuals.sensor == "tls" else 1.0
     if unshared < by.least_unshared_share:
-        return [], tried, _describe_shared_variance(excess, unshared, residuals.sigma)
-    pairs = [
-        _JointFit.fitted(squares, shapes, [first, second], candidates)
-        for first, second in combinations(range(len(shapes)), 2)
-        if candidates[first].name != candidates[second].name
-    ]
+        return [], tried, _describe_shared_variance(float(added.mean()), unshared, residuals.sigma)
+    pairs = seen.pairs()
     pair = max(pairs, key=lambda fit: fit.score, default=best)
-    free = _best_binned_variance(squares, {name: v[used] for name, v in residuals.covariates.items()})
-    # no form of a variance is exact, so a second effect or a free form must explain more than the inexact part of the first
-    needed = max(by.least_gain, thresholds().mean.class_share * best.gain)
-    agreement = _agreement(squares, best.added(shapes), pair.added(shapes), block)
-    agreed = pair.score > best.score + needed and agreement > thresholds().edges.block_sigmas
-    chosen = pair if agreed and all(float(theta.max()) > 0 for theta in pair.theta) else best
-    ahead, agreement = free.score - chosen.score, _agreement(squares, chosen.added(shapes), free.added, block)
-    free_fits_better = ahead > needed and agreement > thresholds().edges.least_block_sigmas
-    empirical = free_fits_better and ahead > by.nonparametric_share * chosen.gain
-    note = f"the noise also varies with {free.name}, which no effect of the catalogue explains" if free_fits_better else ""
-    if empirical:
-        chosen, note = best, ""
+    chosen = pair if seen.fits_better(pair, best) and all(float(theta.max()) > 0 for theta in pair.theta) else best
+    free = best_binned_variance(seen.squares, {name: each[seen.used] for name, each in residuals.covariates.items()})
     tried = sorted([*tried, VarianceScore(free.name, free.gain, free.score, True)], key=lambda item: -item.score)
-    margin = equivalence_margin(chosen.gain)
-    found = []
-    for place, number in enumerate(chosen.members):
-        candidate, theta = candidates[number], chosen.theta[place]
-        others = [fit for fit in (singles if len(chosen.members) == 1 else pairs) if _replaces_only(fit, chosen, number)]
+    if not seen.free_form_fits_better(free, chosen):
+        return seen.terms(chosen, pairs, p_value), tried, ""
+    if free.score - chosen.score > by.nonparametric_share * chosen.gain:
+        named = [replace(each, name=f"variance by {free.name}", empirical=True) for each in seen.terms(best, pairs, p_value)]
+        return named, tried, ""
+    note = f"the noise also varies with {free.name}, which no effect of the catalogue explains"
+    return seen.terms(chosen, pairs, p_value), tried, note
+
+
+@dataclass(frozen=True)
+class _SquaredDeviations:
+    """Squared deviations of residuals within small squares of the wall, and what noise effects would add to them.
+
+    candidates: the noise effects; used: (n,) points with a deviation that is no outlier, m of them; squares: (m,) squared
+    deviations over the predicted ones; shapes: for each effect, (m, k) variance that its parameters add at their typical sizes,
+    over the predicted variance; block: (m,) wall block of each point; singles: the fit of each effect alone.
+    """
+
+    candidates: list[VarianceCandidate]
+    used: BoolArray
+    squares: FloatArray
+    shapes: list[FloatArray]
+    block: NDArray[np.int64]
+    singles: list[VarianceFit]
+
+    @classmethod
+    def of(
+        cls, residuals: Residuals, cells: WallCells, value: FloatArray, candidates: list[VarianceCandidate], random: KeyedRandom
+    ) -> _SquaredDeviations | None:
+        """Compute the deviations, and fit each effect. None if no cell has enough points for a plane and a deviation from it.
+
+        This is done twice: the second time, points have the weight of their fitted noise in the planes of their cells, which
+        noisy points would shift.
+        """
+        predicted = residuals.sigma**2 * _expected_mean_square(residuals, cells, random)
+
+        def deviations(weighted: Residuals) -> _SquaredDeviations | None:
+            z = standardised_deviations(weighted, cells, value)
+            if not np.isfinite(z).any():
+                return None
+            used = np.isfinite(z) & (np.abs(z) < thresholds().points.outlier_sigmas * max(1.0, nmad(z, 0.0)))
+            squares = (z * weighted.sigma)[used] ** 2 / predicted[used]
+            shapes = [candidate.variance[used] / predicted[used, None] for candidate in candidates]
+            singles = [VarianceFit.fitted(squares, shapes, [number], candidates) for number in range(len(shapes))]
+            return cls(candidates, used, squares, shapes, wall_block_numbers(residuals.wall_xy[used], cells.side_m), singles)
+
+        first = deviations(residuals)
+        if first is None:
+            return None
+        added = candidates[first.best.members[0]].variance @ first.best.theta[0]
+        return deviations(replace(residuals, sigma=np.sqrt(residuals.sigma**2 + added)))
+
+    @property
+    def best(self) -> VarianceFit:
+        """The best fit of one effect."""
+        return max(self.singles, key=lambda fit: fit.score)
+
+    def pairs(self) -> list[VarianceFit]:
+        """Fits of two different effects together."""
+        return [
+            VarianceFit.fitted(self.squares, self.shapes, [first, second], self.candidates)
+            for first, second in combinations(range(len(self.shapes)), 2)
+            if self.candidates[first].name != self.candidates[second].name
+        ]
+
+    def scores(self) -> list[VarianceScore]:
+        """Scores of the effects, best first. Of an effect that was tried with several values of a parameter, the best counts."""
+        tried = [VarianceScore(each.name, fit.gain, fit.score) for each, fit in zip(self.candidates, self.singles, strict=True)]
+        best = {item.name: item for item in sorted(tried, key=lambda item: item.score)}
+        return sorted(best.values(), key=lambda item: -item.score)
+
+    def fits_better(self, pair: VarianceFit, single: VarianceFit) -> bool:
+        """Whether two effects fit clearly better than one all over the wall."""
+        agreement = self._agreement(single.added(self.shapes), pair.added(self.shapes))
+        return pair.score > single.score + _least_lead(self.best.gain) and agreement > thresholds().edges.block_sigmas
+
+    def free_form_fits_better(self, free: BinnedVariance, chosen: VarianceFit) -> bool:
+        """Whether a variance that is free in bins fits clearly better than noise effects all over the wall."""
+        agreement = self._agreement(chosen.added(self.shapes), free.added)
+        return free.score - chosen.score > _least_lead(self.best.gain) and agreement > thresholds().edges.least_block_sigmas
+
+    def _agreement(self, first: FloatArray, second: FloatArray) -> float:
+        """Return how far wall blocks agree that the second variance fits better, so that the gain is not due to a few blocks.
+
+        It is the log-likelihood ratio over the root sum of squares of the wall blocks' contributions.
+        """
+        terms = 0.5 * (self.squares * (second - first) / ((1 + first) * (1 + second)) + np.log1p(first) - np.log1p(second))
+        sums = np.bincount(np.unique(self.block, return_inverse=True)[1], terms)
+        return float(sums.sum()) / max(float(np.linalg.norm(sums)), 1e-300)
+
+    def terms(self, chosen: VarianceFit, pairs: list[VarianceFit], p_value: float) -> list[VarianceTerm]:
+        """Describe each effect of a fit, with those that cannot be told from it. pairs: the fits of two effects."""
+        return [self._term(place, chosen, pairs, p_value) for place in range(len(chosen.members))]
+
+    def _term(self, place: int, chosen: VarianceFit, pairs: list[VarianceFit], p_value: float) -> VarianceTerm:
+        number, theta = chosen.members[place], chosen.theta[place]
+        candidate, margin = self.candidates[number], equivalence_margin(chosen.gain)
+        others = [fit for fit in (self.singles if len(chosen.members) == 1 else pairs) if fit.replaces_only(chosen, number)]
+        pair = max(pairs, key=lambda fit: fit.score, default=chosen)
         # two other effects that fit better, but by no more than the inexact part of one, may be the truth as well
-        others += [pair] if chosen is best and number not in pair.members and pair.score > best.score + by.least_gain else []
-        near = {candidates[n].name for fit in others if fit.score > chosen.score - margin for n in fit.members}
-        alike = near - {candidates[each].name for each in chosen.members}
-        parameters = candidate.parameters(theta)
-        std = candidate.standard_deviations(theta, chosen.error[place])
-        gain = chosen.gain - max(
-            (fit.gain for fit in singles if fit.members != (number,) and fit.members[0] in chosen.members), default=0.0
+        also = len(chosen.members) == 1 and number not in pair.members
+        others += [pair] if also and pair.score > chosen.score + thresholds().variance.least_gain else []
+        near = {self.candidates[n].name for fit in others if fit.score > chosen.score - margin for n in fit.members}
+        alone = (fit.gain for fit in self.singles if fit.members != (number,) and fit.members[0] in chosen.members)
+        return VarianceTerm(
+            name=candidate.name,
+            effect=candidate.name,
+            indistinguishable=tuple(sorted(near - {self.candidates[each].name for each in chosen.members})),
+            p_value=p_value,
+            gain=chosen.gain - max(alone, default=0.0),
+            parameters=candidate.parameters(theta),
+            std=candidate.standard_deviations(theta, chosen.error[place]),
+            empirical=False,
+            variance=candidate.variance @ theta,
         )
-        name = f"variance by {free.name}" if empirical else candidate.name
-        found.append(
-            VarianceTerm(
-                name,
-                candidate.name,
-                tuple(sorted(alike)),
-                p_value,
-                gain,
-                parameters,
-                std,
-                empirical,
-                candidate.variance @ theta,
-            )
-        )
-    return found, tried, note
+
+
+def _least_lead(gain: float) -> float:
+    """Return by how much a second effect or a free form must score more than the best effect, whose form is never exact.
+
+    gain: log-likelihood ratio of the best effect.
+    """
+    return max(thresholds().variance.least_gain, thresholds().mean.class_share * gain)
 
 
 def _describe_shared_variance(excess: float, unshared: float, sigma: FloatArray) -> str:
@@ -395,103 +396,3 @@ def _expected_mean_square(residuals: Residuals, cells: WallCells, random: KeyedR
         shared = field.weights @ (root @ draws.standard_normal(len(root)))
         squares.append(np.nanmean(standardised_deviations(residuals, cells, shared + own * draws.standard_normal(len(own))) ** 2))
     return float(np.mean(squares))
-
-
-def _best_variants(tried: list[VarianceScore]) -> list[VarianceScore]:
-    """Return the best score of each noise effect; some effects were tried with several values of a parameter."""
-    return list({item.name: item for item in sorted(tried, key=lambda item: item.score)}.values())
-
-
-@dataclass(frozen=True)
-class _JointFit:
-    """Some candidates fitted together.
-
-    members: numbers of the candidates; theta, error: coefficients of each and their standard deviations; gain: log-likelihood
-    ratio; score: gain minus the number of parameters.
-    """
-
-    members: tuple[int, ...]
-    theta: tuple[FloatArray, ...]
-    error: tuple[FloatArray, ...]
-    gain: float
-    score: float
-
-    @classmethod
-    def fitted(
-        cls, squares: FloatArray, shapes: list[FloatArray], members: list[int], candidates: list[VarianceCandidate]
-    ) -> _JointFit:
-        """Fit 1 + sum theta f to the squared deviations by Fisher scoring, theta >= 0."""
-        columns = np.concatenate([shapes[number] for number in members], axis=1)
-        scale = 1 / np.maximum(columns.mean(axis=0), 1e-300)
-        columns = columns * scale
-        theta = np.full(len(scale), max(float(np.mean(squares)) - 1, 1e-3) / len(scale))
-        information = np.eye(len(scale))
-        for _ in range(_FISHER_ROUNDS):
-            total = 1 + columns @ theta
-            slope = 0.5 * columns.T @ ((squares - total) / total**2)
-            information = 0.5 * (columns / total[:, None] ** 2).T @ columns
-            free = (theta > 0) | (slope > 0)
-            step = np.zeros(len(theta))
-            step[free] = np.linalg.lstsq(information[np.ix_(free, free)], slope[free], rcond=1e-10)[0]
-            theta = np.maximum(theta + step, 0.0)
-        gain = _log_likelihood_gain(squares, columns @ theta)
-        error = np.sqrt(np.maximum(np.diag(np.linalg.pinv(information, hermitian=True)), 0.0))
-        ends = np.cumsum([shapes[number].shape[1] for number in members])[:-1]
-        score = gain - sum(candidates[number].cost for number in members)
-        return cls(tuple(members), tuple(np.split(theta * scale, ends)), tuple(np.split(error * scale, ends)), gain, score)
-
-    def added(self, shapes: list[FloatArray]) -> FloatArray:
-        """(n,) added variance over the predicted one."""
-        return np.asarray(sum(shapes[number] @ theta for theta, number in zip(self.theta, self.members, strict=True)))
-
-
-def _replaces_only(fit: _JointFit, chosen: _JointFit, number: int) -> bool:
-    """Whether a fit differs from the chosen one in one candidate only."""
-    return number not in fit.members and set(chosen.members) - {number} <= set(fit.members)
-
-
-def _agreement(squares: FloatArray, first: FloatArray, second: FloatArray, block: NDArray[np.int64]) -> float:
-    """Return how far wall blocks agree that the second variance fits better, so that the gain is not due to a few blocks.
-
-    It is the log-likelihood ratio over the root sum of squares of the wall blocks' contributions.
-    """
-    terms = 0.5 * (squares * (second - first) / ((1 + first) * (1 + second)) + np.log1p(first) - np.log1p(second))
-    sums = np.bincount(np.unique(block, return_inverse=True)[1], terms)
-    return float(sums.sum()) / max(float(np.linalg.norm(sums)), 1e-300)
-
-
-def _log_likelihood_gain(squares: FloatArray, added: FloatArray) -> float:
-    """Log-likelihood ratio of an added variance (n,)."""
-    return float(0.5 * np.sum(squares * added / (1 + added) - np.log1p(added)))
-
-
-def _best_binned_variance(squares: FloatArray, covariates: Mapping[str, FloatArray]) -> _BinnedVariance:
-    """Return the covariate along which a variance free in each bin explains most.
-
-    Tails that are heavier than those of a normal distribution let the variances of bins differ more by chance. What the bins
-    explain beside their common mean is divided by that factor, which follows from the kurtosis.
-    """
-    mean = float(np.mean(squares))
-    tails = max(0.5 * (float(np.mean(squares**2)) / mean**2 - 1), 1.0)
-    common = 0.5 * len(squares) * (mean - 1 - np.log(mean))
-    best = _BinnedVariance("", -np.inf, -np.inf, np.zeros(len(squares)))
-    for name, group in _bins(covariates):
-        count = np.maximum(np.bincount(group), 1)
-        variance = np.maximum(np.bincount(group, squares) / count, 1e-9)
-        gain = float(common + 0.5 * np.sum(count * np.log(mean / variance)) / tails)
-        if gain - len(count) > best.score:
-            best = _BinnedVariance(name, gain, gain - len(count), (variance - 1)[group])
-    return best
-
-
-def _bins(covariates: Mapping[str, FloatArray]) -> Iterator[tuple[str, NDArray[np.int64]]]:
-    """Yield (n,) bin numbers: equally filled bins of each covariate; scan lines, image rows and columns, and cycles of them."""
-    for name, values in covariates.items():
-        if name not in ("edge_step", "line"):
-            yield name, np.searchsorted(np.quantile(values, np.linspace(0, 1, _BINS + 1)[1:-1]), values)
-        if name in ("line", "image_x", "image_y"):
-            lines, group = np.unique(np.round(values, _LINE_DIGITS), return_inverse=True)
-            if 1 < len(lines) < len(values) / _FEWEST_IN_LINE:
-                yield name, group
-                number = np.rint((values - values.min()) / np.diff(lines).min()).astype(np.int64)
-                yield from ((name, number % cycle) for cycle in range(2, _LONGEST_CYCLE + 1))
