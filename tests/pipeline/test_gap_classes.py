@@ -76,10 +76,13 @@ def test_a_refitted_effect_must_explain_more_than_chance(refitted: float, linear
     assert fit("a", [refitted, 0.0], [True, False]).is_significant(given, search) == significant
 
 
-def outcome(estimates: list[Estimate], together: bool = True) -> SearchOutcome:
-    """Return an explanation of residuals by some effects. together: whether one search selected all of them."""
-    first = [each.chosen for each in estimates]
-    return SearchOutcome(first if together else first[:1], estimates, Any, Any, [], ())  # type: ignore[arg-type]
+def outcome(estimates: list[Estimate], together: bool = True, p_value: float | None = None) -> SearchOutcome:
+    """Return an explanation of residuals by some effects.
+
+    together: whether one search selected all of them; p_value: of the misfit that it leaves.
+    """
+    first, search = [each.chosen for each in estimates], SimpleNamespace(goodness_of_fit_p_value=lambda _: p_value)
+    return SearchOutcome(first if together else first[:1], estimates, search, Any, [], ())  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize(("further", "named", "alike"), [(1, "b", ("d",)), (2, "a", ("b",)), (0, "d", ("b",))])
@@ -110,6 +113,21 @@ def test_another_fit_that_needs_fewer_further_effects_replaces_the_best(
     assert tried == ["b", "d"]
     assert first.candidate.name == named
     assert first.chosen.indistinguishable == alike
+
+
+@pytest.mark.parametrize(("left_by_a", "left_by_b", "named"), [(0.4, 0.002, "a"), (0.4, 0.3, "b"), (0.002, 0.002, "b")])
+def test_fewer_effects_are_no_alternative_if_they_leave_a_misfit_that_more_do_not(
+    monkeypatch: pytest.MonkeyPatch, left_by_a: float, left_by_b: float, named: str
+) -> None:
+    """Beside fit a, which is best, one more effect is found, beside fit b none."""
+    best = outcome([estimated("a"), estimated("x")], together=False, p_value=left_by_a)
+    alone = outcome([estimated("b")], p_value=left_by_b)
+    monkeypatch.setattr(nonlinear_refit, "_search_beside", lambda *_: alone)
+    monkeypatch.setattr(nonlinear_refit, "_within_bounds", lambda *_: True)
+    nothing: Any = None
+    found = _search_beside_others(nothing, best, [fit("a", [0.0], [True]), fit("b", [1.0], [True])], best)
+    assert found.estimates[0].candidate.name == named
+    assert nonlinear_refit._simpler(nothing, best, alone, ties=False) is (best if named == "a" else alone)
 
 
 def test_effects_of_an_explanation_keep_the_classes_of_the_linearised_search_unless_it_tells_them_apart() -> None:

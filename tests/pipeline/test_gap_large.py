@@ -244,7 +244,9 @@ def _explanation(physical: int, empirical: int) -> Any:
     """Return an explanation with the given numbers of effects of the catalogue and of empirical terms."""
     kinds = [False] * physical + [True] * empirical
     estimates = [SimpleNamespace(candidate=SimpleNamespace(empirical=each)) for each in kinds]
-    return SimpleNamespace(chosen=estimates, estimates=estimates, complexity=(empirical, len(kinds)))
+    return SimpleNamespace(
+        chosen=estimates, estimates=estimates, complexity=(empirical, len(kinds)), leaves_more_misfit_than=lambda _: False
+    )
 
 
 @pytest.mark.parametrize(

@@ -324,7 +324,6 @@ def _result(
     """Return the scores and tests of a selection; left: (n,) residuals after its systematic effects."""
     design, sensor = found.search.design, given.part.sensor
     said = (*_note_repetition(found.estimates), *_note_oblique_waves(found), *_note_most_similar(found, given.part))
-    p_value = found.search.goodness_of_fit_p_value(found.tried)
     alone = first.score_families(()) if found.estimates else ()
     names, cosines, survival = first.design.identifiability()
     tried = found.chosen[0].family_scores if found.chosen else found.tried
@@ -332,8 +331,8 @@ def _result(
         tried=tuple(item for item in tried if not item.name.startswith(SPATIAL_NULL)),
         variance_tried=tuple(noise.tried),
         systematic=frozenset(f"{sensor}.{each.candidate.name}" for each in found.estimates),
-        p_value=p_value,
-        p_without_effects=first.goodness_of_fit_p_value(alone) if alone else p_value,
+        p_value=found.p_value,
+        p_without_effects=first.goodness_of_fit_p_value(alone) if alone else found.p_value,
         unexplained_noise=(
             NoiseRatio(1.0, False) if noise.terms else NoiseRatio.of(found.residuals, design.cells, left, given.random)
         ),
@@ -377,9 +376,8 @@ def _detectable_sizes(
 
 def _explains_everything(found: SearchOutcome) -> bool:
     """Whether only effects of the catalogue were found, and no misfit is left beside them."""
-    p_value = found.search.goodness_of_fit_p_value(found.tried)
     physical = not any(each.candidate.empirical for each in found.estimates)
-    return physical and p_value is not None and p_value > thresholds().verdict.rejection_p
+    return physical and found.p_value is not None and found.p_value > thresholds().verdict.rejection_p
 
 
 def keep_implausible_in_class(
@@ -463,8 +461,7 @@ def _note_repetition(estimates: list[Estimate]) -> list[str]:
 
 def _note_most_similar(found: SearchOutcome, part: Residuals) -> list[str]:
     """Note on the best candidate where a misfit is left and nothing was accepted."""
-    p_value = found.search.goodness_of_fit_p_value(found.tried)
-    if found.estimates or p_value is None or p_value > thresholds().verdict.rejection_p:
+    if found.estimates or found.p_value is None or found.p_value > thresholds().verdict.rejection_p:
         return []
     best = max((item for item in found.tried if not item.name.startswith(SPATIAL_NULL)), key=lambda item: item.score)
     what = f"a change with {best.name} ({best.candidate.form})" if best.empirical else best.name

@@ -177,7 +177,8 @@ def select_and_refit(given: SearchInput, first: MeanSearch) -> SearchOutcome:
 def _simpler(given: SearchInput, best: SearchOutcome | None, other: SearchOutcome | None, ties: bool) -> SearchOutcome | None:
     """Return the simpler of two explanations of the residuals, after a search for effects that the second one may lack.
 
-    That search only adds effects, so it is left out where the second explanation cannot be simpler.
+    That search only adds effects, so it is left out where the second explanation cannot be simpler. One that still leaves a
+    misfit, where the first leaves none, is no alternative.
     best: the first explanation; None if there is none. ties: whether the second one is returned if both are equally simple.
     """
     if other is None or not other.chosen:
@@ -189,6 +190,8 @@ def _simpler(given: SearchInput, best: SearchOutcome | None, other: SearchOutcom
     if not wins((0, sum(not each.candidate.empirical for each in other.estimates))):
         return best
     other = _search_beside(given, other) or other
+    if best is not None and other.leaves_more_misfit_than(best):
+        return best
     return other if wins(other.complexity) and _within_bounds(given, other) else best
 
 
@@ -271,8 +274,8 @@ def _search_beside_others(given: SearchInput, plain: SearchOutcome, fits: list[_
     """Repeat the search beside other effects that were refitted alone, which may be those that belong to the further ones.
 
     Such a fit is worse than the best one by less than the further effects gain. Its class holds the other fits that are as good:
-    an error of this size is far from where the linearised search compares effects. The simplest explanation wins, and of equally
-    simple ones the most likely one.
+    an error of this size is far from where the linearised search compares effects. The simplest explanation wins, unless it
+    leaves a misfit that the first one does not leave, and of equally simple ones the most likely one.
     """
     gained, found = sum(each.chosen.log_likelihood_ratio for each in best.estimates[1:]), [best]
     for other in fits[1:]:
@@ -282,7 +285,9 @@ def _search_beside_others(given: SearchInput, plain: SearchOutcome, fits: list[_
         near = (each.name for each in fits if each is not other and abs(each.score - other.score) < margin)
         chosen = replace(other.estimate.chosen, indistinguishable=tuple(sorted(near)))
         beside = _search_beside(given, replace(plain, chosen=[chosen], estimates=[replace(other.estimate, chosen=chosen)]))
-        if beside is not None and beside.complexity <= best.complexity and _within_bounds(given, beside):
+        if beside is None or beside.complexity > best.complexity or beside.leaves_more_misfit_than(best):
+            continue
+        if _within_bounds(given, beside):
             found.append(beside)
     fewest = min(each.complexity for each in found)
     return _most_likely(given, plain.search, [each for each in found if each.complexity == fewest])
@@ -295,7 +300,7 @@ def _most_likely(given: SearchInput, first: MeanSearch, found: list[SearchOutcom
     enters the class of the one in its place.
     """
     different = {frozenset(_names(each)): each for each in reversed(found)}.values()
-    fits = [fit for each in different if (fit := _ExplanationFit.of(given, each)) is not None]
+    fits = [fit for each in different if len(different) > 1 and (fit := _ExplanationFit.of(given, each)) is not None]
     if len(fits) < 2:
         return found[0]
     common = np.all([each.used for each in fits], axis=0)

@@ -14,7 +14,7 @@ from pipeline.gap.mean.selection import FamilyScore, SelectedEffect
 from pipeline.gap.naming.named_effects import Estimate
 from pipeline.gap.noise_and_edges.variance_model import VarianceTerm
 from pipeline.gap.residuals.residuals import Residuals
-from pipeline.gap.thresholds import equivalence_margin
+from pipeline.gap.thresholds import equivalence_margin, thresholds
 from scene.common.keyed_random import KeyedRandom
 
 
@@ -73,6 +73,19 @@ class SearchOutcome:
         Pairs are compared in this order; empirical terms name no cause.
         """
         return sum(each.candidate.empirical for each in self.estimates), len(self.estimates)
+
+    @property
+    def p_value(self) -> float | None:
+        """P-value of the misfit that this explanation leaves; None if no effect was left to try."""
+        return self.search.goodness_of_fit_p_value(self.tried)
+
+    def leaves_more_misfit_than(self, other: SearchOutcome) -> bool:
+        """Tell whether this explanation leaves a misfit, so that it may lack an effect, where another one leaves none."""
+
+        def leaves_misfit(p_value: float | None) -> bool:
+            return p_value is not None and p_value <= thresholds().verdict.rejection_p
+
+        return leaves_misfit(self.p_value) and not leaves_misfit(other.p_value)
 
     def with_classes_of(self, linear: SearchOutcome) -> SearchOutcome:
         """Add to the class of each effect what a linearised search could not tell from it, unless this explanation clearly can.
