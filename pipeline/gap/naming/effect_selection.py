@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import cache, partial
 from typing import Any
 
 import numpy as np
@@ -344,7 +344,7 @@ def _result(
         },
         reference_sigma=design.reference_sigma([each.candidate for each in found.further]),
         detectable=lambda: _detectable_sizes(found, [each.effect for each in noise.terms], left, given.random),
-        p_value_beside=lambda kept: _p_value_beside(search, found, kept),
+        p_value_beside=cache(lambda kept: _p_value_beside(search, found, kept)),
     )
 
 
