@@ -234,10 +234,8 @@ def test_an_unknown_without_a_name_says_what_remains_is_most_like() -> None:
     tried = (item(f"{SPATIAL_NULL} 30", 9.0, "step"), item("azimuth", 8.0, "spline"), item("row_jitter", 3.0, ""))
     part: Any = SimpleNamespace(unit_m=np.full(3, 0.1))
     for p_value, estimates, expected in ((0.004, [], 1), (0.02, [], 0), (None, [], 0), (0.004, ["effect"], 0)):
-        search = SimpleNamespace(
-            goodness_of_fit_p_value=lambda _, p_value=p_value: p_value, fitted_std=lambda each: 0.01 * each.score
-        )
-        found: Any = SimpleNamespace(search=search, tried=tried, estimates=estimates)
+        search = SimpleNamespace(fitted_std=lambda each: 0.01 * each.score)
+        found: Any = SimpleNamespace(search=search, p_value=p_value, tried=tried, estimates=estimates)
         said = _note_most_similar(found, part)
         assert len(said) == expected
         assert all("a change with azimuth (spline), 8 mm" in words for words in said)

@@ -80,9 +80,7 @@ def test_such_an_effect_stands_where_it_leaves_no_more_than_chance(
 ) -> None:
     """An effect that is implausibly large is kept if it leaves nothing; one that only looks similar has another signature."""
     estimate = SimpleNamespace(candidate=SimpleNamespace(empirical=empirical))
-    found: Any = SimpleNamespace(
-        search=SimpleNamespace(goodness_of_fit_p_value=lambda _: p_value), tried=(), estimates=[estimate]
-    )
+    found: Any = SimpleNamespace(p_value=p_value, estimates=[estimate])
     assert effect_selection._explains_everything(found) is all_of_it
 
 
