@@ -21,7 +21,8 @@ class VarianceThresholds(ThresholdGroup):
         6.0,
         "log-likelihood",
         "The best noise term needs at least this log-likelihood ratio, a second one beside it and an effect on the returns "
-        "too. Beside other effects, an effect must gain more than this on validation blocks to be named, not only mentioned. "
+        "too. Beside other effects, an effect must gain more than this on validation blocks to be named, not only mentioned, "
+        "unless only it explains a misfit. "
         "A non-parametric term, a variance free in bins or losses free by direction must score this much more than the best "
         "effect of the catalogue to be chosen instead, a term of two covariates this much more than one of one, and any of "
         "them this much more than an error of the reference can. In all, a non-parametric term needs twice this: the "
