@@ -27,7 +27,7 @@ from PIL import Image
 from pipeline.config.simulation import SimulationConfig
 from pipeline.formats.measurements.measurement import Measurement, StereoMeasurement, TlsMeasurement, read_measurement
 from pipeline.formats.point_cloud import PointCloud
-from pipeline.gap.naming.verdict import MUCH_MOVED, NOT_DESCRIBED, PARTLY_EXPLAINED, STILL_OPEN, VERDICTS
+from pipeline.gap.naming.verdict import MUCH_MOVED, NOT_DESCRIBED, PARTLY_EXPLAINED, STILL_OPEN, TOO_NOISY, VERDICTS
 from pipeline.gap.naming.workflow import GapDiagnosis, diagnose
 from pipeline.gap.report.covariate_ranking import quantile_bins, rank_disagreements
 from pipeline.gap.report.figures import gap_figure, maps_figure
@@ -311,8 +311,8 @@ def verdicts() -> dict[str, Verdict]:
     """Return the verdicts by name, with their examples."""
     return {
         "named": Verdict(
-            "The model without the effect is rejected: the best candidate has a p-value of at most 0.004. One effect of the "
-            "catalogue explains the disagreement. No other effect explains nearly as much, and no empirical curve explains "
+            "An effect passed its test, with a p-value of at most 0.004. It is the only effect of the catalogue that is needed "
+            "to explain the disagreement. No other effect explains nearly as much, and no empirical curve explains "
             "clearly more.",
             "Compare the value of the effect with that of the manufacturer or of a calibration. Simulate with model_after.yaml, "
             "which contains the effect.",
@@ -344,7 +344,7 @@ def verdicts() -> dict[str, Verdict]:
             "[unknown](unknown.md).",
         ),
         "unknown": Verdict(
-            "The model is rejected, but the catalogue does not explain why. There are three cases, and the report begins with "
+            "The model is rejected, but the catalogue does not explain why. There are four cases, and the report begins with "
             "another sentence in each:\n\n"
             "1. *An empirical term describes the misfit.* A curve of one covariate, such as the azimuth or the time, explains "
             "clearly more (a penalised log-likelihood ratio higher by 6) than any effect of the catalogue. The report says the "
@@ -355,11 +355,13 @@ def verdicts() -> dict[str, Verdict]:
             + NOT_DESCRIBED + "\" It also says where the misfit is and how large.\n"
             "3. *The named effects do not help enough.* They leave most of the gap open. Or they leave a misfit with a p-value "
             "of at most 0.01, and the score on validation blocks does not show that they make the gap smaller. The report says, "
-            "for example: \"" + STILL_OPEN + "\"",
+            "for example: \"" + STILL_OPEN + "\"\n"
+            "4. *The model predicts too much noise.* No effect was found, and only the noise of the model keeps it away from the "
+            "floor. The report says: \"" + TOO_NOISY + "\"",
             "See in the report on which covariate the disagreement depends, and in what form. In case 1, model_after.yaml holds "
             "the empirical term, which reproduces the disagreement in simulations, but only within the measured range of the "
             "covariate (`along`, in the unit of the covariate: rad for angles). In case 2 it holds no further effect, in case 3 "
-            "the named effects, which explain too little.",
+            "the named effects, which explain too little, and in case 4 the lower noise.",
             "The ranges of a scanner jump by 4 mm in the middle of the scan, as after a knock.",
             _case(seed=18, ranges=lambda scan: scan.R + 0.002 * np.where(scan.az > 1.6, 1.0, -1.0)),
             "This is case 1. The second line of the terminal is the empirical term: a curve through 65 points between the "

@@ -22,6 +22,12 @@ EXAMPLE = """  scarpsim gap my_measurement --out diagnosis
   scarpsim gap --identifiability my_site.yaml --sensor tls --out plans/gap"""
 
 
+_SOURCE_OPTIONS = (
+    "reference", "scanner", "model", "position", "unit", "reference_unit", "columns", "cameras", "photographs", "pair", "scan"
+)  # fmt: skip
+"""Names of the options that describe raw scans."""
+
+
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments of `scarpsim gap` on its parser."""
     parser.add_argument(
@@ -73,6 +79,14 @@ def run(arguments: argparse.Namespace) -> CommandOutput:
 
     out = arguments.out or new_folder(Path("runs"), "gap")
     check_place(out)
+    if (out / "measurement.yaml").exists():
+        raise InputError(
+            "the folder is a measurement, whose files the results would join",
+            where=f"--out {out}",
+            remedy="name another folder for the results",
+        )
+    if arguments.sensor and not arguments.identifiability:
+        raise InputError("the option is for --identifiability only", where="--sensor", remedy="leave the option out")
     return _identifiability(arguments, out) if arguments.identifiability else _diagnosis(arguments, out)
 
 
@@ -81,7 +95,8 @@ def _measurement_folder(arguments: argparse.Namespace, out: Path) -> Path:
     given: list[Path] = arguments.measurement
     if _of_monitor(given):
         return _folder_of_monitoring(arguments, given[0], out / "measurement")
-    if len(given) == 1 and (given[0].is_dir() or given[0].suffix in ("", ".yaml", ".yml")) and not arguments.reference:
+    if len(given) == 1 and (given[0].is_dir() or given[0].suffix in ("", ".yaml", ".yml")):
+        _check_options(arguments, _SOURCE_OPTIONS, "the folder of a measurement, which knows its files and its instrument")
         return given[0]
     if not arguments.reference:
         raise InputError(
@@ -105,17 +120,23 @@ def _folder_of_monitoring(arguments: argparse.Namespace, given: Path, out: Path)
     from pipeline.formats.files.atomic import empty_folder
     from pipeline.monitoring.stable_measurement import build_from_monitoring
 
-    for name in ("reference", "unit", "reference_unit", "columns", "cameras", "photographs", "pair", "scan"):
-        if getattr(arguments, name):
-            raise InputError(
-                "the option cannot be combined with a folder of scarpsim monitor, which knows its files",
-                where=f"--{name.replace('_', '-')}",
-                allowed="--scanner, --model and --position",
-                remedy="leave the option out, or give the raw scans instead of the folder",
-            )
+    allowed = {"scanner", "model", "position"}
+    known = "a folder of scarpsim monitor, which knows its files; allowed are --scanner, --model and --position"
+    _check_options(arguments, tuple(name for name in _SOURCE_OPTIONS if name not in allowed), known)
     empty_folder(out)
     found = build_from_monitoring(given, out, scanner=arguments.scanner, model=arguments.model, position=arguments.position)
     return found.folder
+
+
+def _check_options(arguments: argparse.Namespace, names: tuple[str, ...], known: str) -> None:
+    """Raise InputError if one of some options is given. known: the input that makes them meaningless."""
+    for name in names:
+        if getattr(arguments, name):
+            raise InputError(
+                f"the option cannot be combined with {known}",
+                where=f"--{name.replace('_', '-')}",
+                remedy="leave the option out, or give the raw scans instead of the folder",
+            )
 
 
 def _diagnosis(arguments: argparse.Namespace, out: Path) -> CommandOutput:

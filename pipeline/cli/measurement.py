@@ -32,7 +32,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         nargs="+",
         type=Path,
         metavar="SCAN",
-        help="raw scan: las, laz, e57, ply, ptx, pts, xyz, csv; several scans are epochs",
+        help="raw scan: las, laz, e57, ply, ptx, pts, xyz, csv; several scans are epochs, or scans from several places",
     )
     add_source_arguments(parser)
     parser.add_argument("--out", type=Path, required=True, metavar="FOLDER", help="new folder of the measurement")
@@ -113,6 +113,8 @@ def build_measurement_folder(arguments: argparse.Namespace, scans: list[Path], o
 
     empty_folder(out)
     request = _request(arguments, scans)
+    if arguments.scanner and arguments.model:
+        raise InputError("the option cannot be combined with --model", where="--scanner", remedy="give only one of them")
     if arguments.cameras and arguments.photographs:
         raise InputError("the option cannot be combined with --cameras", where="--photographs", remedy="leave one of them out")
     if arguments.photographs:

@@ -305,7 +305,7 @@ def load_config(path: Path, overrides: Sequence[str | Override], sensor: SensorN
         If anything is wrong, or if the config only has models of another sensor than `sensor`.
     """
     values = load_yaml(path)
-    if values is None:
+    if values is None or values == {}:
         raise InputError(
             "the config contains no key",
             where=str(path),

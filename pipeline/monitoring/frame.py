@@ -79,7 +79,19 @@ def wall_frame(points: FloatArray, towards: FloatArray, direction: FloatArray | 
         A place in front of the wall, survey coordinates, m, which tells the sign of z.
     direction : (3,) array or None
         Direction of z, survey coordinates, of any length; None: the normal of the points' mean plane.
+
+    Raises
+    ------
+    InputError
+        If the direction has no length.
     """
+    if direction is not None and not np.any(direction):
+        raise InputError(
+            "the direction has no length",
+            where="--direction",
+            allowed="three numbers that are not all 0",
+            remedy="give the direction from the wall towards the sensor, in the coordinates of the files",
+        )
     few = points[:: max(len(points) // _SAMPLE, 1)]
     if direction is None:
         return WallFrame.fit(few, towards)

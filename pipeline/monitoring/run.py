@@ -143,6 +143,7 @@ def _monitored(
     started: BackgroundWorkers | None,
 ) -> Result:
     """Do the work of `monitor`, on workers that were started before if there are any."""
+    scanner_model(options)  # a wrong preset or file is reported before any work
     with progress.stage(f"reference {sources[0].name}"):
         site = prepared(sources[0], options)
     fingerprint = _fingerprint(site, options)

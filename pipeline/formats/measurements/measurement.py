@@ -323,6 +323,8 @@ class Material:
 def read_measurement(folder: Path) -> Measurement:
     """Read a measurement from a folder with measurement.yaml; raise InputError that names the file and the wrong key."""
     path = folder / FILE if folder.is_dir() else folder
+    if not folder.exists():
+        raise InputError("there is no such folder", where=str(folder), remedy="name the folder of a measurement")
     if not path.is_file():
         raise InputError(f"there is no {FILE}", where=str(folder), remedy="name the folder of a measurement")
     values = load_yaml(path)
