@@ -323,10 +323,9 @@ class Material:
 def read_measurement(folder: Path) -> Measurement:
     """Read a measurement from a folder with measurement.yaml; raise InputError that names the file and the wrong key."""
     path = folder / FILE if folder.is_dir() else folder
-    if not folder.exists():
-        raise InputError("there is no such folder", where=str(folder), remedy="name the folder of a measurement")
     if not path.is_file():
-        raise InputError(f"there is no {FILE}", where=str(folder), remedy="name the folder of a measurement")
+        problem = f"there is no {FILE}" if folder.exists() else "there is no such folder"
+        raise InputError(problem, where=str(folder), remedy="name the folder of a measurement")
     values = load_yaml(path)
     config, base = parse(MeasurementConfig, values, str(path)), path.parent
     model = read_model(base / config.model)
