@@ -61,6 +61,10 @@ def test_the_sensor_is_asked_for_a_config_only(folder: Path, capsys: pytest.Capt
     assert "--identifiability only" in said(capsys, "gap", folder, "--sensor", "tls", "--out", folder.parent / "out")
 
 
+def test_one_measurement_is_diagnosed_at_a_time(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert "a folder can only be given alone" in said(capsys, "gap", folder, folder, "--out", folder.parent / "out")
+
+
 def test_a_folder_that_is_not_there_is_called_so(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert "there is no such folder" in said(capsys, "gap", tmp_path / "nothing", "--out", tmp_path / "out")
 

@@ -98,6 +98,13 @@ def _measurement_folder(arguments: argparse.Namespace, out: Path) -> Path:
     if len(given) == 1 and (given[0].is_dir() or given[0].suffix in ("", ".yaml", ".yml")):
         _check_options(arguments, _SOURCE_OPTIONS, "the folder of a measurement, which knows its files and its instrument")
         return given[0]
+    folders = [path for path in given if path.is_dir()]
+    if folders:
+        raise InputError(
+            f"a folder can only be given alone, but there are {len(given)} inputs",
+            where=str(folders[0]),
+            remedy="diagnose one folder at a time, or give raw scans only",
+        )
     if not arguments.reference:
         raise InputError(
             "this is a raw file, and no reference is given to compare it with",

@@ -29,7 +29,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--series",
         action="store_true",
-        help="also promise what the config's series shows: smallest rockfall and lead times, by trial epochs (minutes)",
+        help="also predict what the config's series shows: smallest rockfall and lead times, by trial epochs (minutes)",
     )
     parser.add_argument("--out", type=Path, metavar="DIR", help="folder for maps and report (default: a new one under runs/)")
     parser.add_argument("--seed", type=at_least(0), metavar="N", help="seed of a procedural wall (default: the config's)")
