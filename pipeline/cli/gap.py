@@ -95,7 +95,9 @@ def _measurement_folder(arguments: argparse.Namespace, out: Path) -> Path:
     given: list[Path] = arguments.measurement
     if _of_monitor(given):
         return _folder_of_monitoring(arguments, given[0], out / "measurement")
-    if len(given) == 1 and (given[0].is_dir() or given[0].suffix in ("", ".yaml", ".yml")):
+    if len(given) == 1 and not given[0].suffix and not given[0].exists():
+        return given[0]  # its reader says that there is no such folder
+    if len(given) == 1 and (given[0].is_dir() or given[0].suffix in (".yaml", ".yml")):
         _check_options(arguments, _SOURCE_OPTIONS, "the folder of a measurement, which knows its files and its instrument")
         return given[0]
     folders = [path for path in given if path.is_dir()]
