@@ -95,7 +95,7 @@ _CAUSES = {
     "angle noise of 1 mrad": (
         "it moves points beyond their triangle of the reference, and noise that depends on the incidence is named beside it"
     ),
-    "`trees`, a constant offset": "an error of an angle and a periodic error of the range together describe it equally well",
+    "`trees`, a constant offset": "an error of an angle describes a part of it, and is named beside a smaller offset",
     "`rocks`": (
         "the residuals scatter 1.9 times as much as the model predicts, and neighbours share half of that (relief, coordinates "
         "rounded to 6 cm); the scan has an intensity bias of -0.011 m of its own, which nearly cancels the one of case 44, and "
@@ -114,8 +114,8 @@ _CAUSES = {
         "sine with overtones gets no name; the last digits of the estimated pose decide"
     ),
     "`matcher`": (
-        "whether edge fattening is named before the injection depends on single points: with one usable point more (8,269 in "
-        "place of 8,268) it was not named, and then all six cases counted as wrong"
+        "which effect is named before the injection depends on single points: `affinity_skew` here, edge fattening and a focal "
+        "length with one usable point less; beside what was named, a distortion of a smaller size fits"
     ),
 }
 """Where cases fail, and why."""
