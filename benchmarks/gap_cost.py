@@ -39,7 +39,10 @@ PARTS: dict[str, list[tuple[Any, str]]] = {
     ],
     "edge effects": [(selection_passes, "_find_edge_effects"), (selection_passes, "_with_effects")],
     "scene changes": [(selection_passes, "find_scene_changes")],
-    "signatures": [(module, "candidate_families") for module in (effect_selection, nonlinear_refit, search_beside_effects)],
+    "signatures": [
+        *((module, "candidate_families") for module in (effect_selection, search_beside_effects)),
+        (nonlinear_refit, "catalogue_families"),
+    ],
     "search: design and null": [(MeanSearch, "__init__")],
     "search: selection": [(MeanSearch, "select")],
     "refits": [(nonlinear_refit, name) for name in ("_strongest_single_fits", "_screened_single_fits", "search_at_joint_fit")],

@@ -199,7 +199,7 @@ def select_effects(given: SelectionInput) -> tuple[list[NamedEffect], SelectionR
         before = frozenset(each.candidate.name for each in found.estimates)
         return keep_implausible_in_class(again, found.chosen, before, wrong), result
     systematic = [effect_from_estimate(each, found.residuals) for each in found.estimates]
-    result = _result(given, search, first, found, noise, left)
+    result = _result(given, search, first, found, noise, left, frozenset(item.name for item in systematic))
     angles = [each for each in systematic if each.effect is AngleEmpirical]
     if angles and not model_has(measurement, AngleEmpirical.tag()):
         return _select_beside_angle_terms(given, angles, result)
@@ -319,9 +319,15 @@ def _with_grid_noise(
 
 
 def _result(
-    given: SelectionInput, search: SearchInput, first: MeanSearch, found: SearchOutcome, noise: _FittedNoise, left: FloatArray
+    given: SelectionInput,
+    search: SearchInput,
+    first: MeanSearch,
+    found: SearchOutcome,
+    noise: _FittedNoise,
+    left: FloatArray,
+    systematic: frozenset[str],
 ) -> SelectionResult:
-    """Return the scores and tests of a selection; left: (n,) residuals after its systematic effects."""
+    """Return the scores and tests of a selection; left: (n,) residuals after its systematic effects; systematic: their names."""
     design, sensor = found.search.design, given.part.sensor
     said = (*_note_repetition(found.estimates), *_note_oblique_waves(found), *_note_most_similar(found, given.part))
     alone = first.score_families(()) if found.estimates else ()
@@ -330,7 +336,7 @@ def _result(
     return SelectionResult(
         tried=tuple(item for item in tried if not item.name.startswith(SPATIAL_NULL)),
         variance_tried=tuple(noise.tried),
-        systematic=frozenset(f"{sensor}.{each.candidate.name}" for each in found.estimates),
+        systematic=systematic,
         p_value=found.p_value,
         p_without_effects=first.goodness_of_fit_p_value(alone) if alone else found.p_value,
         unexplained_noise=(
@@ -485,9 +491,8 @@ def _note_oblique_waves(found: SearchOutcome) -> list[str]:
 
 def _note_left_out(excluded: frozenset[tuple[str, bool]]) -> list[str]:
     """Return remarks for the report on families of effects that were not tried."""
-    said = (
-        f"non-parametric terms of {name}" if empirical else name for name, empirical in sorted(excluded - {NONPARAMETRIC_TERMS})
-    )
+    out = sorted(excluded - {NONPARAMETRIC_TERMS})
+    said = (f"non-parametric terms of {name}" if empirical else name for name, empirical in out)
     why = (
         "its best value is outside the bounds of the effect, or it is many typical sizes, the registration absorbs nearly all "
         "of it, and a misfit is left"

@@ -10,7 +10,7 @@ from pipeline.formats.measurements.measurement import Measurement
 from pipeline.gap.mean.candidates import Candidate, prior_precision
 from pipeline.gap.mean.search import MeanSearch
 from pipeline.gap.mean.selection import SelectedEffect
-from pipeline.gap.naming.candidate_families import candidate_families
+from pipeline.gap.naming.candidate_families import catalogue_families
 from pipeline.gap.naming.effect_screening import gauss_newton_step, screen_effects
 from pipeline.gap.naming.named_effects import Estimate, out_of_bounds
 from pipeline.gap.naming.search_beside_effects import (
@@ -80,7 +80,7 @@ class _SingleFit:
 
     def improved(self, given: SearchInput, first: MeanSearch) -> _SingleFit | None:
         """Return the fit after one Gauss-Newton step from the present values; None for the reasons of `of`."""
-        candidate = recomputed(self.estimate.candidate, candidate_families(self.measurement, self.residuals))
+        candidate = recomputed(self.estimate.candidate, catalogue_families(self.measurement, self.residuals))
         width = candidate.columns.shape[1]
         step = gauss_newton_step(self.residuals, candidate.columns, prior_precision(candidate, width), np.zeros(width))
         return _SingleFit.of(given, first, replace(self.estimate, values=self.estimate.values + step))

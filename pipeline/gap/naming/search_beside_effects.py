@@ -86,10 +86,11 @@ def search_at_joint_fit(given: SearchInput) -> SearchOutcome | None:
 
     Returns
     -------
-    SearchOutcome or None : the selected effects; None if a fitted effect is out of bounds or too few points remain.
+    SearchOutcome or None : the selected effects; None if the catalogue has none for these residuals, if a fitted effect is out of
+        bounds, or if too few points remain.
     """
     plain = [each for each in given.families if isinstance(each, Candidate) and not each.empirical]
-    fitted = fit_jointly(given, plain)
+    fitted = fit_jointly(given, plain) if plain else None
     if fitted is None:
         return None
     measurement, at, explained = fitted

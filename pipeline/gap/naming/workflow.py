@@ -168,7 +168,7 @@ def _diagnose(measurement: Measurement, clock: _Clock, random: KeyedRandom) -> G
     aligned, plain, surveyed, held_out_points = _aligned(measurement)
     clock.lap("residuals")
     if plain.usable.sum() < thresholds().points.fewest:
-        return _insufficient_data(measurement, plain, clock)
+        return _insufficient_data(measurement, plain, surveyed, clock)
     inputs = PassInputs(aligned, plain, held_out_points)
     validated = _select_and_validate(inputs, random)
     clock.lap("naming")
@@ -300,7 +300,7 @@ def _nameable(inputs: PassInputs) -> bool:
 
 def _share_of_model_noise(share: float, residuals: Residuals) -> float:
     """Convert a ratio of the predicted standard deviation to one of the model's own, which excludes the reference error."""
-    if not isinstance(residuals, TlsResiduals) or not residuals.reference_error_m:
+    if share >= 1 or not isinstance(residuals, TlsResiduals) or not residuals.reference_error_m:
         return share
     whole, reference = float(np.median(residuals.sigma**2)), float(np.median(residuals.reference_variance))
     own = max(whole - reference, _LEAST_MODEL_SHARE**2 * whole)
@@ -467,12 +467,11 @@ def _findings_first(notes: list[str], about_data: Sequence[str]) -> list[str]:
     return [*(each for each in notes if each not in about_data), *(each for each in notes if each in about_data)]
 
 
-def _insufficient_data(measurement: Measurement, residuals: Residuals, clock: _Clock) -> GapDiagnosis:
-    """Return the diagnosis of a measurement with too few points."""
+def _insufficient_data(measurement: Measurement, residuals: Residuals, pose: FloatArray, clock: _Clock) -> GapDiagnosis:
+    """Return the diagnosis of a measurement with too few points. pose: the estimated one, as in the diagnosis."""
     count, least = int(residuals.usable.sum()), thresholds().points.fewest
     note = f"{count} points on smooth parts of the reference and stable ground, but {least} are needed"
     empty = np.zeros(len(residuals))
-    pose = np.zeros(residuals.pose_jacobian.shape[1] if isinstance(residuals, SurfaceResiduals) else 6)
     return GapDiagnosis(
         "insufficient_data", (), (), residuals, empty > 1, residuals.value, residuals.value, pose, measurement.model,
         None, (), (), _remaining_entry(Evidence(None, None), [note], {}), {"names": [], "cosines": [], "survival": []},
