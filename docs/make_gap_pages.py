@@ -368,7 +368,7 @@ def verdicts() -> dict[str, Verdict]:
             "azimuths 0.9508 and 2.049 rad, with values from -1.53 to 3.75 mm.\n\n"
             "The curve is smooth, so it cannot follow a jump exactly: the map on the right still shows two bands beside the "
             "jump. Even so 100 % of the gap is closed. The gap is a mean over all validation blocks, and most of them lie away "
-            "from the jump, so the bands hardly change it. The p-value of 0.008 belongs to a test that looks for such local "
+            "from the jump, so the bands hardly change it. The p-value of 0.01 belongs to a test that looks for such local "
             "patterns, and says that something remains.",
         ),
         "no_gap": Verdict(

@@ -21,6 +21,7 @@ from pipeline.gap.naming.nonlinear_refit import (
     _SingleFit,
     _with_equivalence_class,
 )
+from pipeline.gap.naming.search_beside_effects import search_at_joint_fit
 from pipeline.gap.naming.search_outcome import SearchOutcome
 
 CHI2: Any = SimpleNamespace(design=SimpleNamespace(log_likelihood=lambda value, _: -0.5 * float(value @ value)))
@@ -141,3 +142,9 @@ def test_effects_of_an_explanation_keep_the_classes_of_the_linearised_search_unl
     assert refitted.estimates[0].chosen.indistinguishable == ("a", "b")
     other = outcome([estimated("x"), estimated("z")])
     assert other.with_classes_of(linear) is other
+
+
+def test_without_effects_of_the_catalogue_there_is_no_joint_fit() -> None:
+    """Surfaces without cameras have empirical terms only."""
+    given: Any = SimpleNamespace(families=[Candidate("x", np.zeros((1, 1)), lambda _: {}, ("a",), empirical=True)])
+    assert search_at_joint_fit(given) is None

@@ -46,3 +46,18 @@ def test_what_one_of_two_true_effects_leaves_is_significant(tmp_path: Path, monk
         alone = result.p_value_given([kept])
         assert alone is not None, "the misfit beside a part of the effects was not tested"
         assert alone <= 0.01
+
+
+def test_an_empirical_term_that_is_kept_counts_in_the_misfit_that_is_left(tmp_path: Path) -> None:
+    """The ranges follow a smooth curve of the azimuth, which no effect of the catalogue describes."""
+    write_scan(tmp_path, 5, step_rad=0.009, ranges=lambda scan: scan.R + 0.004 * np.tanh(8 * (scan.az - 1.6)))
+    there, residuals, _ = align(read_measurement(tmp_path))
+    part = residuals.part(residuals.usable)
+    named, result = effect_selection.select_effects(
+        effect_selection.SelectionInput(there, part, fit_pose_robustly(part)[2], KeyedRandom(1))
+    )
+    assert "empirical" in {item.kind for item in named}
+    assert result.systematic == {item.name for item in named if not item.adds_variance}
+    assert result.p_value_given(named) == result.p_value
+    assert result.p_without_effects is not None
+    assert result.p_without_effects <= 0.01
