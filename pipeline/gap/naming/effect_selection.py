@@ -129,8 +129,8 @@ class SelectionInput:
     random : source of random numbers for the null distributions.
     excluded : effects that are not tried, as pairs (name, whether it is an empirical term); `NONPARAMETRIC_TERMS` stands for
         all empirical terms.
-    noise : (n,) what is left of the residuals beside an error that is so large that most of the residuals would look like noise;
-        noise terms are fitted to it. None: the registered residuals.
+    noise : (n,) registered residuals with a large error in the model, beside which the search is made; noise terms are fitted to
+        them. None: there is no such error, and the registered residuals serve.
     grid_noise : noise that neighbouring points share, if a preceding selection found it in its residuals. It is then part of
         the model from the start, because it imitates empirical terms and errors of the reference. None in a first selection.
     locking : pixel locking whose amplitude a preceding selection found with the noise. None: it is searched for.

@@ -29,9 +29,9 @@ from pipeline.gap.thresholds import equivalence_margin, thresholds
 from scene.geometry.mesh import FloatArray
 
 _MOST_CONVERGED, _MOST_ROUNDS, _CONVERGED_GAIN = 3, 8, 1.0
-"""Effects that are refitted to convergence, and most iterations of each."""
+"""Most effects that are refitted to convergence, most iterations of each, and the gain of log-likelihood below which they end."""
 _ABSORBED_SHARE = 0.5
-"""Share of an effect's gain that may be linearisation error of the others."""
+"""The linearised model is inexact if its error exceeds this share of the log-likelihood ratio of any selected effect."""
 
 
 @dataclass(frozen=True)
@@ -73,7 +73,7 @@ class _SingleFit:
         return cls(estimate, at_points_of(found, given.part), measurement, value, kept, log_likelihood)
 
     def is_significant(self, given: SearchInput, first: MeanSearch) -> bool:
-        """Tell whether the effect explains the residuals better than the best of all effects would if there were none."""
+        """Tell whether the score is significant: the best of all effects reaches it by chance with p <= `mean.significance`."""
         chosen, candidate = self.estimate.chosen, self.estimate.candidate
         linearised = first.design.log_likelihood(np.where(self.used, given.part.value, 0.0), [candidate])
         return first.p_value(chosen.score + self.log_likelihood - linearised) <= thresholds().mean.significance
@@ -203,8 +203,9 @@ def _within_bounds(given: SearchInput, outcome: SearchOutcome) -> bool:
 def _strongest_single_fits(given: SearchInput, first: MeanSearch, together: list[SelectedEffect]) -> list[_SingleFit] | None:
     """The effects that alone explain most, refitted without linearising, best first.
 
-    Empty if no effect is strong. None where the linearised model is good enough: its error is below the gain of any selected
-    effect, or only one is selected, which is not strong.
+    Empty if no effect is strong, or none can be put into the model. None if the linearised model is kept. Either it misjudges the
+    strongest effect by less than `mean.class_margin` and less than half of the log-likelihood ratio of each selected effect. Or
+    it selected a single effect of the catalogue, and no effect is strong.
     """
     found: list[_SingleFit] = []
     tolerance = min([thresholds().mean.class_margin, *(_ABSORBED_SHARE * each.log_likelihood_ratio for each in together)])
@@ -224,7 +225,12 @@ def _strongest_single_fits(given: SearchInput, first: MeanSearch, together: list
 
 
 def _screened_single_fits(given: SearchInput, first: MeanSearch, alone: list[_SingleFit]) -> list[_SingleFit]:
-    """Add fits of one effect alone that leave the least noise and are significant; of each effect the best one, best first."""
+    """Refit the effects that alone leave the smallest residuals, and add the significant ones to the given fits.
+
+    Returns
+    -------
+    The best fit of each effect, the best effect first.
+    """
     sized = screen_effects(given.measurement, given.part, first.effect_variants(), _MOST_CONVERGED)
     more = [each for each in (_single_fit(given, first, item.candidate, item.values) for item in sized) if each is not None]
     refitted = [each for each in _best_variants(given, first, more) if each.is_significant(given, first)] if more else []
@@ -247,7 +253,7 @@ def _single_fit(
 def _best_variants(given: SearchInput, first: MeanSearch, found: list[_SingleFit]) -> list[_SingleFit]:
     """The best effects, refitted to convergence, best first.
 
-    The best effect is also refitted for other cameras or periods, because which one it is may not show before.
+    The best effect is also refitted for other cameras or choices of parameters, because which one it is may not show before.
     """
     ranked = sorted(found, key=lambda each: -each.log_likelihood)
     variants = {each.name: each for each in reversed(ranked)}
@@ -271,11 +277,11 @@ def _with_class_of_first(found: SearchOutcome, fits: list[_SingleFit]) -> Search
 
 
 def _search_beside_others(given: SearchInput, plain: SearchOutcome, fits: list[_SingleFit], best: SearchOutcome) -> SearchOutcome:
-    """Repeat the search beside other effects that were refitted alone, which may be those that belong to the further ones.
+    """Repeat the search beside other effects that were refitted alone: the true set of effects may hold one of these.
 
-    Such a fit is worse than the best one by less than the further effects gain. Its class holds the other fits that are as good:
-    an error of this size is far from where the linearised search compares effects. The simplest explanation wins, unless it
-    leaves a misfit that the first one does not leave, and of equally simple ones the most likely one.
+    A fit is tried if its log-likelihood is lower than that of the best one by no more than the further effects gain. Its class
+    holds the fits with nearly its score, because the linearised search is inexact for an error of this size. The simplest
+    explanation wins, unless it leaves a misfit that the first one does not leave, and of equally simple ones the most likely one.
     """
     gained, found = sum(each.chosen.log_likelihood_ratio for each in best.estimates[1:]), [best]
     for other in fits[1:]:
@@ -375,7 +381,10 @@ def _converged(given: SearchInput, first: MeanSearch, alone: _SingleFit) -> _Sin
 
 
 def _search_beside(given: SearchInput, chosen: SearchOutcome) -> SearchOutcome | None:
-    """Search for effects in addition to the selected ones; None if there are none, or if one is out of bounds."""
+    """Repeat the search with the selected effects of the catalogue in the sensor model.
+
+    None if none was selected, if one is out of bounds, or if too few rays meet the reference.
+    """
     physical = [each for each in chosen.estimates if not each.candidate.empirical]
     if not physical or out_of_bounds(given.measurement, chosen.estimates, chosen.residuals):
         return None

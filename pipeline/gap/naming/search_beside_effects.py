@@ -171,7 +171,7 @@ def aligned_with_estimates(given: SearchInput, effects: list[Estimate]) -> Align
 
 
 def with_variance_refitted(given: SearchInput, at: Residuals) -> Residuals:
-    """Fit noise terms to residuals beside the effects in the model; without these, their patterns would look like noise.
+    """Fit noise terms to residuals with effects in the model, because the patterns of effects would look like noise.
 
     given : holds the function that fits noise terms; at : residuals with the effects in the model.
 

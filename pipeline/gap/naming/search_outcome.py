@@ -92,7 +92,8 @@ class SearchOutcome:
 
         A class holds the effects that the measurement cannot tell apart. Either search has its own error, so an effect is left
         out only if it scores worse here by twice the margin. Nothing is added unless both explain the residuals by the same
-        effects, two or more. Effects that were refitted one by one have no scores beside the others here.
+        effects, two or more. Effects that were refitted one by one have no scores beside the others here, so all
+        that the linearised search could not tell from them is added.
 
         linear: the explanation of the linearised search.
         """

@@ -99,7 +99,7 @@ class PassInput:
         plain : its residuals without edge effects.
         held_out_points : (N,) true for points that are kept for validation.
         edge_effects : edge effects to put into the model. Their attribute `touched` must have a value for each of the N points.
-        large_effect : an error so large that without it most of the rock would count as changed. It is in the model while
+        large_effect : an error so large that without it much of the rock would count as changed. It is in the model while
             changes and outliers are found, and not in the residuals.
         """
         touched = np.any([np.zeros(len(plain), dtype=bool), *(each.touched[plain.index] for each in edge_effects)], axis=0)

@@ -403,13 +403,13 @@ def _with_heavy_tails(
     tails = find_heavy_tails(value / part.sigma / scale, wall_block_numbers(part.wall_xy, side_m))
     if tails is None or not tails.uniform or not tails.sigma:
         return named, tails
-    rows_of_tails = [item for item in named if not item.adds_variance]
-    if len(rows_of_tails) < len(named):
-        _, _, middle = _smooth_residuals_with(measurement, rows_of_tails)
-        if middle**2 - 1 > thresholds().variance.least_excess:
+    without_noise = [item for item in named if not item.adds_variance]
+    if len(without_noise) < len(named):
+        _, _, core_noise_ratio = _smooth_residuals_with(measurement, without_noise)
+        if core_noise_ratio**2 - 1 > thresholds().variance.least_excess:
             return named, tails
     heavy = effect_from_tails(part, tails.sigma * float(np.median(part.sigma)), tails.gain)
-    return [*rows_of_tails, *only_within_bounds(measurement.model, [heavy])[0]], tails
+    return [*without_noise, *only_within_bounds(measurement.model, [heavy])[0]], tails
 
 
 def _smooth_residuals_with(measurement: Measurement, named: list[NamedEffect]) -> tuple[Residuals, FloatArray, float]:

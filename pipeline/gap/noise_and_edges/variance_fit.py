@@ -145,8 +145,8 @@ class BinnedVariance:
 def best_binned_variance(squares: FloatArray, covariates: Mapping[str, FloatArray]) -> BinnedVariance:
     """Return the covariate along which a variance free in each bin explains most.
 
-    Tails that are heavier than those of a normal distribution let the variances of bins differ more by chance. What the bins
-    explain beside their common mean is divided by that factor, which follows from the kurtosis.
+    If the tails are heavier than those of a normal distribution, the variances of bins differ more by chance, by a factor that
+    follows from the kurtosis. What the bins explain beside their common mean is divided by this factor.
 
     squares : (n,) squared deviations of the residuals over their predicted variance.
     covariates : (n,) values of each covariate, by name.
