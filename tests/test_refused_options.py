@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from pipeline.cli.main import main
+from pipeline.formats.files.atomic import check_place
 from pipeline.monitoring.frame import wall_frame
 from pipeline.monitoring.options import MonitorOptions
 from pipeline.monitoring.reading import EpochSource
@@ -94,3 +95,19 @@ def test_monitor_refuses_an_unknown_scanner_before_it_maps_anything(tmp_path: Pa
     with pytest.raises(InputError, match="nosuch"):
         monitor(sources, tmp_path / "out", MonitorOptions(scanner="nosuch"))
     assert not list((tmp_path / "out").glob("*.tif"))
+
+
+def test_a_parent_that_another_command_removes_meanwhile_is_made_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Commands that start together with outputs in one new folder each test the place and remove what they made."""
+    make, calls = Path.mkdir, []
+
+    def removed_once(path: Path, *mode: int, **how: bool) -> None:
+        calls.append(path)
+        if len(calls) == 1:
+            raise FileNotFoundError(2, "No such file or directory")
+        make(path, *mode, **how)
+
+    monkeypatch.setattr(Path, "mkdir", removed_once)
+    check_place(tmp_path / "new" / "mine")
+    assert len(calls) > 1
+    assert not (tmp_path / "new").exists()

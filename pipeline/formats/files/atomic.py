@@ -28,6 +28,8 @@ _FORBIDDEN = {errno.EACCES, errno.EPERM, errno.EROFS}
 _NO_SUCH_PLACE = {errno.ENOTDIR, errno.EISDIR, errno.ENAMETOOLONG, errno.EEXIST, errno.ENOENT}
 """Errors of impossible paths."""
 _ELSEWHERE = "choose another folder with --out"
+_MOST_TRIES = 20
+"""Attempts to make a folder whose parent another command removes."""
 
 
 _noted: ContextVar[list[Path] | None] = ContextVar("noted", default=None)
@@ -175,7 +177,7 @@ def check_place(out: Path) -> None:
     """Raise InputError, naming --out, if `out` cannot be a writable folder; it is created as a test and removed again."""
     made = _missing(out)
     try:
-        out.mkdir(parents=True, exist_ok=True)
+        _make_folder(out)
         if not os.access(out, os.W_OK):
             raise PermissionError(errno.EACCES, os.strerror(errno.EACCES))
     except (OSError, ValueError) as error:  # ValueError: a null character
@@ -183,6 +185,15 @@ def check_place(out: Path) -> None:
         raise InputError(f"the path cannot be used as a folder ({reason})", where=f"--out {out}", remedy=_ELSEWHERE) from None
     finally:
         _remove_empty(made)
+
+
+def _make_folder(out: Path) -> None:
+    """Make a folder and its parents, again if another command that tests its own place removes an empty parent meanwhile."""
+    for _ in range(_MOST_TRIES):
+        with suppress(FileNotFoundError):
+            out.mkdir(parents=True, exist_ok=True)
+            return
+    out.mkdir(parents=True, exist_ok=True)
 
 
 @contextmanager
