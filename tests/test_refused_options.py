@@ -25,7 +25,7 @@ def said(capsys: pytest.CaptureFixture[str], *words: str | Path) -> str:
 
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
-    """Folder of a measurement, of which nothing is read."""
+    """Folder of a measurement; the commands are refused before they read its files."""
     (tmp_path / "mine").mkdir()
     (tmp_path / "mine" / "measurement.yaml").write_text("sensor: tls\n")
     return tmp_path / "mine"

@@ -326,7 +326,7 @@ def test_effects_that_leave_no_point_to_score_gain_nothing() -> None:
 def test_a_weak_effect_is_named_if_a_misfit_is_left_only_without_it(
     with_it: float | None, without: float, systematic: bool, stays: bool
 ) -> None:
-    """The given p-values are those of the misfit with and without it; noise explains no such misfit."""
+    """The p-values are those of the misfit with and without the weak effect. A noise effect cannot explain a misfit of means."""
     strong, weak = (NamedEffect(f"tls.{name}", "physical", {"name": name}, {}, (), 0.002, 9.0) for name in ("a", "b"))
     names = frozenset({"tls.a", "tls.b"} if systematic else {"tls.a"})
     selection: Any = SimpleNamespace(systematic=names, p_value_given=lambda named: with_it if weak in named else without)

@@ -340,11 +340,11 @@ def _with_alternative(best: SearchOutcome, other: SearchOutcome, lead: float) ->
 
 
 def _registered_residuals(found: Residuals, part: Residuals) -> tuple[FloatArray, BoolArray]:
-    """Register residuals, and return those of all points of `part`.
+    """Subtract what a robust fit of the sensor's pose explains from residuals that may lack some of the points of `part`.
 
     Returns
     -------
-    (n,) residuals, outliers clipped, 0 where a point is not used; and (n,) which points are used.
+    (n,) the rest for each of the n points of `part`, outliers clipped, 0 where a point is not used; and (n,) which are used.
     """
     registered, _, noise_ratio = fit_pose_robustly(found)
     largest = thresholds().points.outlier_sigmas * noise_ratio * found.sigma
