@@ -72,7 +72,9 @@ def test_what_the_linearised_search_could_not_tell_apart_must_differ_clearly(wor
 @pytest.mark.parametrize(("refitted", "linearised", "significant"), [(20.0, 0.0, False), (20.0, 20.0, True), (0.0, 20.0, True)])
 def test_a_refitted_effect_must_explain_more_than_chance(refitted: float, linearised: float, significant: bool) -> None:
     """Smaller residuals raise the score of 199, larger ones lower it, to -1, 199 and 399; a score above 10 is significant."""
-    search: Any = SimpleNamespace(design=CHI2.design, p_value=lambda score: 0.002 if score > 10 else 0.5)
+    search: Any = SimpleNamespace(
+        design=CHI2.design, score_alone=lambda _: 199.0, p_value=lambda score: 0.002 if score > 10 else 0.5
+    )
     given: Any = SimpleNamespace(part=SimpleNamespace(value=np.array([linearised, 90.0])))
     assert fit("a", [refitted, 0.0], [True, False]).is_significant(given, search) == significant
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -24,7 +25,7 @@ def _ranges(scan: Scan) -> Array:
     return scan.R + 0.004 * np.sin(2 * np.pi * scan.R / 3.0) + 0.006 * (1 / scan.cos_i - 1)
 
 
-def _few(measurement: Measurement, part: Residuals) -> list[Candidate | SineGrid]:
+def _few(measurement: Measurement, part: Residuals, *_: Any) -> list[Candidate | SineGrid]:
     return [each for each in candidate_families(measurement, part) if each.name in (*TRUE, "range_offset", "range_scale")]
 
 

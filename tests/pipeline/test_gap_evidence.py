@@ -34,7 +34,7 @@ from pipeline.gap.naming.workflow import diagnose
 from pipeline.gap.noise_and_edges.variance_model import fit_variance_model, variance_candidates
 from pipeline.gap.residuals.alignment import align, fit_pose_robustly
 from pipeline.gap.residuals.correlated_noise import NO_CORRELATED_NOISE
-from pipeline.gap.residuals.wall_blocks import WallCells, in_validation_blocks
+from pipeline.gap.residuals.wall_blocks import WallCells
 from scene.common.keyed_random import KeyedRandom
 
 
@@ -47,12 +47,12 @@ def test_debris_on_blocks_that_were_held_out_does_not_speak_against_an_effect(tm
             folder, 8, step_rad=0.007, ranges=lambda scan: _bulging(scan) - 0.2 * (scan.rng.uniform(size=len(scan.R)) < share)
         )
         there, found, _ = align(read_measurement(folder))
-        side_m = WallCells.over(found.wall_xy).side_m
-        held_out = in_validation_blocks(found.wall_xy, side_m)
+        blocks = WallCells.over(found.wall_xy).blocks
+        held_out = blocks.for_validation(found.wall_xy)
         rows = np.flatnonzero(held_out | (np.abs(fit_pose_robustly(found)[0]) < 0.05))  # the others no step of naming looks at
         entry = {"name": "range_incidence_bias", "coefficient_m": 0.004}
         effect = NamedEffect("tls.range_incidence_bias", "physical", entry, {}, (), 0.001, 9.0)
-        scored = validate_effects(*subsample(there, found, rows), [effect], ~held_out[rows], 0.0004, side_m)
+        scored = validate_effects(*subsample(there, found, rows), [effect], ~held_out[rows], 0.0004, blocks)
         return 0.0 if scored.failed else scored.named[0].gain
 
     without, with_debris = gain(tmp_path / "without", 0.0), gain(tmp_path / "with", 0.01)
@@ -80,8 +80,8 @@ def test_an_effect_beside_others_whose_one_value_may_be_none_is_only_mentioned(
         NamedEffect("tls.range_incidence_bias", "physical", bias, {"coefficient_m": std}, (), 0.001, 9.0),
         NamedEffect("tls.range_cyclic", "physical", sine, {"amplitude_m": 0.01, "period_m": 1.0}, (), 0.001, 9.0),
     ]
-    side_m = WallCells.over(found.wall_xy).side_m
-    scored = validate_effects(there, found, named, ~in_validation_blocks(found.wall_xy, side_m), 0.0004, side_m)
+    blocks = WallCells.over(found.wall_xy).blocks
+    scored = validate_effects(there, found, named, ~blocks.for_validation(found.wall_xy), 0.0004, blocks)
     assert [item.name for item in scored.weak] == weak
     assert all("within its uncertainty of zero" in describe_weakness(item) for item in scored.weak)
     assert not scored.failed
@@ -157,10 +157,10 @@ def test_noise_of_some_scan_lines_gets_no_name(tmp_path: Path, cycle: int) -> No
     noisy = part.covariates["line"] % cycle == 0
     rng = np.random.default_rng(4)
     value = part.sigma * np.sqrt(1.0 + noisy) * rng.standard_normal(len(part))
-    (found,), _, _ = fit_variance_model(part, WallCells.over(part.wall_xy), value, KeyedRandom(1))
+    (found,), _, note = fit_variance_model(part, WallCells.over(part.wall_xy), value, KeyedRandom(1))
     assert found.effect == "range_noise"
     assert found.empirical == (cycle > 1)
-    assert found.name == ("variance by line" if cycle > 1 else "range_noise")
+    assert note == ("the noise varies with line as no effect of the catalogue does" if cycle > 1 else "")
 
 
 def test_what_a_free_form_misses_of_a_drift_gets_no_name(tmp_path: Path) -> None:
@@ -179,8 +179,8 @@ def test_two_effects_that_only_make_up_for_each_other_both_fail(tmp_path: Path, 
     """
     write_scan(tmp_path, 8, step_rad=0.007, ranges=lambda scan: scan.R + wave_m * np.sin(2 * np.pi * scan.R / 1.7))
     there, residuals, _ = align(read_measurement(tmp_path))
-    side_m = WallCells.over(residuals.wall_xy).side_m
-    held_out = in_validation_blocks(residuals.wall_xy, side_m)
+    blocks = WallCells.over(residuals.wall_xy).blocks
+    held_out = blocks.for_validation(residuals.wall_xy)
     incidence = np.linspace(0.0, 1.4, 141)
     against = -0.022 * (1 / np.cos(incidence) - 1)
     form = {"covariate": "incidence", "along": {"low": 0.0, "high": 1.4}, "values_m": [against.tolist()]}
@@ -191,7 +191,7 @@ def test_two_effects_that_only_make_up_for_each_other_both_fail(tmp_path: Path, 
         NamedEffect("tls.range_incidence_bias", "physical", bias, {}, (), 0.001, 9.0),
         *([NamedEffect("tls.range_cyclic", "physical", sine, {}, (), 0.001, 9.0)] if wave_m else []),
     ]
-    scored = validate_effects(there, residuals, named, ~held_out, 0.0004, side_m)
+    scored = validate_effects(there, residuals, named, ~held_out, 0.0004, blocks)
     assert [item.name for item in scored.named] == (["tls.range_cyclic"] if wave_m else [])
     assert [item.name for item in scored.failed] == ["tls.range_empirical", "tls.range_incidence_bias"]
 

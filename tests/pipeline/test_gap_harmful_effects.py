@@ -16,7 +16,7 @@ from pipeline.gap.naming.gap_score import Gap
 from pipeline.gap.naming.named_effects import NamedEffect
 from pipeline.gap.naming.validation import Validation
 from pipeline.gap.residuals.alignment import align
-from pipeline.gap.residuals.wall_blocks import WallCells, in_validation_blocks
+from pipeline.gap.residuals.wall_blocks import WallCells
 from scene.common.keyed_random import KeyedRandom
 
 
@@ -29,7 +29,7 @@ def _validation(folder: Path, ranges: Callable[[Scan], Array]) -> Validation:
     """Return the input for measuring a gap, for a scan with the given ranges."""
     write_scan(folder, 8, ranges=ranges, step_rad=0.007)
     there, residuals, _ = align(read_measurement(folder))
-    held_out = in_validation_blocks(residuals.wall_xy, WallCells.over(residuals.wall_xy).side_m)
+    held_out = WallCells.over(residuals.wall_xy).blocks.for_validation(residuals.wall_xy)
     return Validation(
         measurement=there,
         residuals=residuals,

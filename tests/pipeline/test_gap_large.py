@@ -40,7 +40,7 @@ from pipeline.gap.naming.workflow import diagnose
 from pipeline.gap.noise_and_edges.variance_model import VarianceTerm, fit_variance_model
 from pipeline.gap.residuals.alignment import align, fit_pose_robustly
 from pipeline.gap.residuals.residuals import Residuals
-from pipeline.gap.residuals.wall_blocks import WallCells, in_validation_blocks
+from pipeline.gap.residuals.wall_blocks import WallBlocks, WallCells
 from pipeline.gap.thresholds import Thresholds, use_thresholds
 from scene.common.keyed_random import KeyedRandom
 from scene.geometry.mesh import FloatArray
@@ -296,7 +296,7 @@ def test_the_effect_that_leaves_the_least_noise_ranks_first(tmp_path: Path, monk
         ("principal_point_x", "left"),
         ("principal_point_x", "right"),
     }
-    inputs = PassInputs(there, residuals, np.zeros(len(there.cloud.points), dtype=bool))
+    inputs = PassInputs(there, residuals, np.zeros(len(there.cloud.points), dtype=bool), WallBlocks(np.zeros(2), 1.0))
     without = PassInput.of(there, residuals, inputs.held_out_points, []).excluded_share
     with use_thresholds(_with_moved_share(0.01)):
         assert inputs.large_effect is not None
@@ -310,7 +310,7 @@ def test_rock_that_moved_is_no_large_effect(tmp_path: Path) -> None:
     """Every eighth point lies 1 m further away, which no effect of the sensor explains."""
     write_scan(tmp_path, 8, step_rad=0.007, ranges=lambda scan: scan.R + 1.0 * (np.arange(len(scan.R)) % 8 == 0))
     there, residuals, _ = align(read_measurement(tmp_path))
-    inputs = PassInputs(there, residuals, np.zeros(len(there.cloud.points), dtype=bool))
+    inputs = PassInputs(there, residuals, np.zeros(len(there.cloud.points), dtype=bool), WallBlocks(np.zeros(2), 1.0))
     assert PassInput.of(there, residuals, inputs.held_out_points, []).excluded_share > 0.1
     with use_thresholds(_with_moved_share(0.1)):
         assert inputs.large_effect is None
@@ -378,13 +378,13 @@ def test_an_effect_that_is_not_there_fails_on_blocks_that_were_held_out(tmp_path
     """The ranges grow with the incidence angle; a scale error of nine parts in 10,000 is also named, but is not there."""
     write_scan(tmp_path, 8, ranges=lambda scan: scan.R + 0.01 * (1 / scan.cos_i - 1), step_rad=0.007)
     there, residuals, _ = align(read_measurement(tmp_path))
-    side_m = WallCells.over(residuals.wall_xy).side_m
-    trained = ~in_validation_blocks(residuals.wall_xy, side_m)
+    blocks = WallCells.over(residuals.wall_xy).blocks
+    trained = ~blocks.for_validation(residuals.wall_xy)
     true, wrong = (
         NamedEffect(f"tls.{name}", "physical", {"name": name, key: value}, {}, (), 0.001, 10.0)
         for name, key, value in (("range_incidence_bias", "coefficient_m", 0.01), ("range_scale", "scale_ppm", 900.0))
     )
-    scored = validate_effects(there, residuals, [wrong, true], trained, 0.0004, side_m)
+    scored = validate_effects(there, residuals, [wrong, true], trained, 0.0004, blocks)
     assert [item.name for item in scored.failed] == ["tls.range_scale"]
     assert [item.name for item in scored.named] == ["tls.range_incidence_bias"]
     assert scored.named[0].gain > 50
@@ -394,13 +394,13 @@ def test_an_effect_from_which_few_blocks_gain_is_only_mentioned_beside_others(tm
     """The ranges grow with the incidence angle; a scale error of 1 ppm, which cannot be told from zero, is also named."""
     write_scan(tmp_path, 8, ranges=lambda scan: scan.R + 0.01 * (1 / scan.cos_i - 1), step_rad=0.007)
     there, residuals, _ = align(read_measurement(tmp_path))
-    side_m = WallCells.over(residuals.wall_xy).side_m
-    trained = ~in_validation_blocks(residuals.wall_xy, side_m)
+    blocks = WallCells.over(residuals.wall_xy).blocks
+    trained = ~blocks.for_validation(residuals.wall_xy)
     true, slight = (
         NamedEffect(f"tls.{name}", "physical", {"name": name, key: value}, {}, (), 0.001, 10.0)
         for name, key, value in (("range_incidence_bias", "coefficient_m", 0.01), ("range_scale", "scale_ppm", 1.0))
     )
-    both = validate_effects(there, residuals, [true, slight], trained, 0.0004, side_m)
+    both = validate_effects(there, residuals, [true, slight], trained, 0.0004, blocks)
     assert [item.name for item in both.named] == ["tls.range_incidence_bias"]
     assert [item.name for item in both.weak] == ["tls.range_scale"]
     assert 0 < both.weak[0].gain < 2

@@ -32,6 +32,7 @@ from pipeline.gap.residuals.alignment import align, at_points_of, compute_residu
 from pipeline.gap.residuals.disparity_raster import DisparityRaster
 from pipeline.gap.residuals.nominal_pair import NominalPair, real_pair
 from pipeline.gap.residuals.stereo_residuals import stereo_residuals
+from pipeline.gap.residuals.wall_blocks import WallBlocks
 from scene.common.keyed_random import KeyedRandom
 from sensors.effects.edge_fattening import EdgeFattening
 from sensors.effects.smoothing import Smoothing
@@ -52,7 +53,7 @@ def test_an_effect_that_turns_all_rays_off_the_wall_leaves_no_residuals(tmp_path
 
 
 def test_noise_found_on_some_points_adds_alike_to_all() -> None:
-    found = VarianceTerm("a", "a", (), 0.1, 3.0, {}, {}, False, np.full(5, 0.04))
+    found = VarianceTerm("a", (), 0.1, 3.0, {}, {}, False, np.full(5, 0.04))
     np.testing.assert_array_equal(found.with_constant_variance(8).variance, np.full(8, 0.04))
 
 
@@ -91,7 +92,7 @@ def test_where_a_free_form_fails_all_is_named_again_without_any(
     monkeypatch.setattr(workflow, "only_within_bounds", lambda _, items: (items, []))
     monkeypatch.setattr(workflow, "_with_heavy_tails", lambda *given: (given[1], None))
     monkeypatch.setattr(workflow, "with_separating_measurements", lambda _, items: items)
-    found = workflow._select_and_validate(PassInputs(there, plain, nowhere), KeyedRandom(1))
+    found = workflow._select_and_validate(PassInputs(there, plain, nowhere, WallBlocks(np.zeros(2), 1.0)), KeyedRandom(1))
     assert [item.name for item in found.named] == kept
     assert found.words == ["tls.range_empirical dropped: it does not improve the validation blocks"]
     assert seen == [False, True]

@@ -344,7 +344,7 @@ def test_white_noise_and_noise_on_a_grid_are_told_apart(made: Callable[..., Made
     spread, _, _ = fit_variance_model(part, WallCells.over(part.wall_xy), value, KeyedRandom(1))
     assert isinstance(there.model, StereoModel)
     (found,) = separate_white_and_grid_noise(spread, part, value, there.model)
-    assert found.name == kind
+    assert found.effect == kind
     # of 64 px nodes there are some 80 on the wall: their own standard deviation varies by 8 %
     assert found.parameters["sigma_px"] == pytest.approx(truth["sigma_px"], rel=0.2)
 
@@ -360,10 +360,10 @@ def test_noise_on_a_grid_goes_before_an_empirical_term(made: Callable[..., Made]
     value = fit_pose_robustly(part)[0]
     spread, _, _ = fit_variance_model(part, WallCells.over(part.wall_xy), value, KeyedRandom(1))
     assert isinstance(there.model, StereoModel)
-    described = [replace(each, name="variance by disparity", empirical=True) for each in spread]
+    described = [replace(each, empirical=True) for each in spread]
     (found,) = separate_white_and_grid_noise(described, part, value, there.model)
     assert found.empirical == empirical
-    assert found.name == ("variance by disparity" if empirical else kind)
+    assert found.effect == kind
 
 
 def test_noise_on_a_coarse_grid_is_found_where_no_point_is_noisier_than_it_should_be(made: Callable[..., Made]) -> None:

@@ -46,9 +46,8 @@ def model_of(pixels: FloatArray) -> tuple[MeanModel, FloatArray]:
     """Return a mean model on cells of 16 points, and the covariance of the noise over sigma, for the model's rows."""
     number = np.unique(pixels // (4 * STRIDE) @ np.array([1, 1000]), return_inverse=True)[1]
     centre = np.stack([np.bincount(number, pixels[:, axis]) / 16 for axis in (0, 1)], axis=1)
-    model = MeanModel(
-        WallCells(4.0 * STRIDE, number, centre), pixels, np.full(len(pixels), SIGMA), GridCorrelatedNoise((NOISE,), pixels)
-    )
+    cells = WallCells(4.0 * STRIDE, number, centre, np.zeros(2))
+    model = MeanModel(cells, pixels, np.full(len(pixels), SIGMA), GridCorrelatedNoise((NOISE,), pixels))
     shared = dense(GridCorrelatedNoise((NOISE,), pixels[model.rows]).node_field(len(pixels))) / SIGMA**2
     return model, model.within_noise.white * np.eye(len(pixels)) + shared
 

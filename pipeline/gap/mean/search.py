@@ -324,12 +324,23 @@ class MeanSearch:
 
         Of variants that differ only in a trial value, such as a limit, the best one stands for all.
         """
-        plain, fixed, _ = self._profile(())
-        ratios = fixed[:, 0] - plain[0]
-        found = [(ratio, each) for ratio, each in zip(ratios, self.design.families.plain, strict=True) if not each.empirical]
+        found = [item for item in self._ratios_alone() if not item[1].empirical]
         ascending = sorted(found, key=lambda item: item[0])
         best = {(each.name, each.names, each.fixed.get("camera")): (ratio, each) for ratio, each in ascending}
         return sorted(best.values(), key=lambda item: -item[0])
+
+    def _ratios_alone(self) -> list[tuple[float, Candidate]]:
+        """Log-likelihood ratio of each variant of each error but sines, without other errors in the model."""
+        plain, fixed, _ = self._profile(())
+        return list(zip(fixed[:, 0] - plain[0], self.design.families.plain, strict=True))
+
+    def score_alone(self, candidate: Candidate) -> float:
+        """Return the penalised log-likelihood ratio of one variant of an error, without other errors in the model.
+
+        candidate: the variant, such as an effect in one camera; one of those that `effect_variants` lists.
+        """
+        ratio = next(ratio for ratio, each in self._ratios_alone() if each is candidate)
+        return float(ratio) - self._null.penalty(candidate.family)
 
     def selected_alone(self, candidate: Candidate) -> SelectedEffect:
         """Describe a candidate effect as if it were the only selected one, to refit it alone without linearisation.

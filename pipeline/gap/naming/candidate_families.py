@@ -66,7 +66,9 @@ def catalogue_families(measurement: Measurement, part: Residuals) -> list[Candid
     return [_with_prior(each) for each in systematic_families(part, measurement)]
 
 
-def candidate_families(measurement: Measurement, part: Residuals) -> list[Candidate | SineGrid]:
+def candidate_families(
+    measurement: Measurement, part: Residuals, catalogue: list[Candidate | SineGrid] | None = None
+) -> list[Candidate | SineGrid]:
     """List all regression terms that a forward selection tries as explanations of the systematic part of residuals.
 
     They are of three kinds: sensor errors of the catalogue that the sensor model lacks; terms along each covariate that name no
@@ -77,13 +79,14 @@ def candidate_families(measurement: Measurement, part: Residuals) -> list[Candid
     ----------
     measurement : the measured points with the sensor model that is tested.
     part : residuals of n of its points, measured minus predicted.
+    catalogue : the effects of the catalogue at these points (`catalogue_families`), if they are known already.
 
     Returns
     -------
     list : each term with its design columns, n rows (change of the observable per unit of a coefficient); for a wave, a grid of
         trial frequencies.
     """
-    named = catalogue_families(measurement, part)
+    named = catalogue_families(measurement, part) if catalogue is None else catalogue
     lowest = {PERIODIC[each.name]: each.frequencies[0] for each in named if isinstance(each, SineGrid) and each.name in PERIODIC}
     free = [
         form

@@ -262,9 +262,9 @@ class _FittedNoise:
         """Fit the noise. value: (n,) residuals after the systematic effects."""
         names = frozenset(name for name, empirical in given.excluded if not empirical)
         found, tried, note = fit_variance_model(part, cells, value, given.random, names)
-        match given.measurement, part:
-            case StereoMeasurement(), StereoResiduals():
-                found = separate_white_and_grid_noise(found, part, value, given.measurement.model)
+        if isinstance(given.measurement, StereoMeasurement) and isinstance(part, StereoResiduals):
+            before, found = found, separate_white_and_grid_noise(found, part, value, given.measurement.model)
+            note = note if [each.empirical for each in before] == [each.empirical for each in found] else ""
         return cls([each for each in found if each.effect not in names], tried, note)
 
     def implausible(self, measurement: Measurement) -> frozenset[tuple[str, bool]]:

@@ -21,6 +21,7 @@ from pipeline.gap.naming.search_beside_effects import (
     repeat_search,
     search_at_joint_fit,
     still_present,
+    too_few_left,
 )
 from pipeline.gap.naming.search_outcome import SearchInput, SearchOutcome
 from pipeline.gap.residuals.alignment import at_points_of, fit_pose_robustly
@@ -66,17 +67,18 @@ class _SingleFit:
             return None
         measurement, found, _ = aligned_with_estimates(given, [estimate])
         found = found.part(np.isin(found.index, given.part.index))
-        value, kept = _registered_residuals(found, given.part)
-        if still_present(found, given.part).mean() < thresholds().points.least_share_on_reference:
+        at = at_points_of(found, given.part)
+        if too_few_left(given, at):
             return None
-        log_likelihood = first.design.log_likelihood(value, [estimate.candidate])
-        return cls(estimate, at_points_of(found, given.part), measurement, value, kept, log_likelihood)
+        value, kept = _registered_residuals(found, given.part)
+        return cls(estimate, at, measurement, value, kept, first.design.log_likelihood(value, [estimate.candidate]))
 
     def is_significant(self, given: SearchInput, first: MeanSearch) -> bool:
         """Tell whether the score is significant: the best of all effects reaches it by chance with p <= `mean.significance`."""
-        chosen, candidate = self.estimate.chosen, self.estimate.candidate
+        candidate = self.estimate.candidate
         linearised = first.design.log_likelihood(np.where(self.used, given.part.value, 0.0), [candidate])
-        return first.p_value(chosen.score + self.log_likelihood - linearised) <= thresholds().mean.significance
+        score = first.score_alone(candidate) + self.log_likelihood - linearised
+        return first.p_value(score) <= thresholds().mean.significance
 
     def improved(self, given: SearchInput, first: MeanSearch) -> _SingleFit | None:
         """Return the fit after one Gauss-Newton step from the present values; None for the reasons of `of`."""
@@ -255,9 +257,9 @@ def _best_variants(given: SearchInput, first: MeanSearch, found: list[_SingleFit
 
     The best effect is also refitted for other cameras or choices of parameters, because which one it is may not show before.
     """
-    ranked = sorted(found, key=lambda each: -each.log_likelihood)
+    ranked = _ranked_on_common_points(found, first)
     variants = {each.name: each for each in reversed(ranked)}
-    likely = sorted(variants.values(), key=lambda each: -each.log_likelihood)[:_MOST_CONVERGED]
+    likely = sorted(variants.values(), key=lambda each: -each.score)[:_MOST_CONVERGED]
     best, *rest = _ranked_on_common_points([_converged(given, first, each) for each in likely], first)
     others = [each for each in ranked if each.name == best.name and each is not variants[best.name]][: _MOST_CONVERGED - 1]
     same = _ranked_on_common_points([best, *(_converged(given, first, each) for each in others)], first)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -47,11 +47,12 @@ def repeat_search(
     at = with_added_variance(at_points_of(found, part), given.added)
     if too_few_left(given, at):
         return None
-    renewed = candidate_families(measurement, at)
+    catalogue = catalogue_families(measurement, at)
+    renewed = candidate_families(measurement, at, catalogue)
     allowed = {(family.name, family.empirical) for family in given.families}
     names = {each.candidate.name for each in known_effects}
     others = [each for each in renewed if (each.name, each.empirical) in allowed and (each.empirical or each.name not in names)]
-    known = [replace(each, candidate=recomputed(each.candidate, renewed)) for each in known_effects]
+    known = [replace(each, candidate=recomputed(each.candidate, catalogue)) for each in known_effects]
     columns = [_free_columns(each) for each in known]
     periodic = [(PERIODIC[name], each.candidate) for each in known if (name := each.candidate.name) in PERIODIC]
     others += [harmonics(covariate, sine, last) for covariate, sine in periodic for last in HARMONIC_ORDERS]
@@ -122,18 +123,50 @@ def fit_jointly(
 
     None instead if an effect is out of bounds or too few points remain.
     """
-    measurement, at, before = given.measurement, given.part, np.inf
-    widths = [each.columns.shape[1] for each in candidates]
-    values = np.zeros(sum(widths))
+    found, before = _JointFit.nothing_of(given, candidates), np.inf
     for _ in range(_MOST_FITS):
-        after = float(np.mean((at.value / at.sigma) ** 2))
-        if after > (1 - least_decrease) * before:
+        step = found.improved(given)
+        if step is None:
+            return None
+        after = step.mean_square
+        if after > before:
             break
-        before = after
-        precision = np.concatenate([prior_precision(each, width) for each, width in zip(candidates, widths, strict=True)])
-        values = values + gauss_newton_step(at, _all_columns(candidates), precision, values)
+        found, converged, before = step, after > (1 - least_decrease) * before, after
+        if converged:
+            break
+    return found.measurement, found.residuals, np.asarray(_all_columns(found.candidates) @ found.values)
+
+
+@dataclass(frozen=True)
+class _JointFit:
+    """Several effects together in the model.
+
+    measurement: with them in its model; residuals: of n points; candidates: the effects as regression terms there; values: (k,)
+    all their coefficients.
+    """
+
+    measurement: Measurement
+    residuals: Residuals
+    candidates: list[Candidate]
+    values: FloatArray
+
+    @classmethod
+    def nothing_of(cls, given: SearchInput, candidates: list[Candidate]) -> _JointFit:
+        """Start with effects of size zero."""
+        return cls(given.measurement, given.part, candidates, np.zeros(sum(each.columns.shape[1] for each in candidates)))
+
+    @property
+    def mean_square(self) -> float:
+        """Mean squared residual, in units of the predicted variance."""
+        return float(np.mean((self.residuals.value / self.residuals.sigma) ** 2))
+
+    def improved(self, given: SearchInput) -> _JointFit | None:
+        """Change the sizes by a Gauss-Newton step; None if an effect is then out of bounds, or too few points remain."""
+        at, widths = self.residuals, [each.columns.shape[1] for each in self.candidates]
+        precision = np.concatenate([prior_precision(each, width) for each, width in zip(self.candidates, widths, strict=True)])
+        values = self.values + gauss_newton_step(at, _all_columns(self.candidates), precision, self.values)
         parts = np.split(values, np.cumsum(widths)[:-1])
-        estimates = [estimate_of_size(each, part) for each, part in zip(candidates, parts, strict=True)]
+        estimates = [estimate_of_size(each, part) for each, part in zip(self.candidates, parts, strict=True)]
         if out_of_bounds(given.measurement, estimates, at):
             return None
         measurement, found, _ = aligned_with_estimates(given, estimates)
@@ -141,8 +174,7 @@ def fit_jointly(
         if too_few_left(given, at):
             return None
         renewed = catalogue_families(measurement, at)
-        candidates = [recomputed(each, renewed) for each in candidates]
-    return measurement, at, np.asarray(_all_columns(candidates) @ values)
+        return _JointFit(measurement, at, [recomputed(each, renewed) for each in self.candidates], values)
 
 
 def estimates_of(search: MeanSearch, chosen: list[SelectedEffect]) -> list[Estimate]:

@@ -30,7 +30,7 @@ from pipeline.gap.residuals.scene_changes import SceneChange, drop_duplicates, f
 from pipeline.gap.residuals.sensor_view import SensorView
 from pipeline.gap.residuals.stereo_residuals import StereoResiduals
 from pipeline.gap.residuals.tls_residuals import TlsResiduals
-from pipeline.gap.residuals.wall_blocks import WallCells
+from pipeline.gap.residuals.wall_blocks import WallBlocks
 from pipeline.gap.thresholds import thresholds
 from scene.common.keyed_random import KeyedRandom
 from scene.geometry.mesh import FloatArray
@@ -57,7 +57,6 @@ class PassInput:
     changed : (n,) true for points in these regions.
     registered_residuals : (n,) residuals after a robust pose fit, in the unit of the observable (m or px).
     noise_ratio : observed over predicted standard deviation of the registered residuals, at least 1.
-    cells : small squares of the wall; the search for systematic errors averages the residuals in each.
     held_out : (n,) true for points that are kept for validation.
     training_rows : (k,) rows of the residuals that the search may use.
     excluded_share : share of the points on smooth rock that the search may not use, because they count as changed or as outliers.
@@ -73,7 +72,6 @@ class PassInput:
     changed: BoolArray
     registered_residuals: FloatArray
     noise_ratio: float
-    cells: WallCells
     held_out: BoolArray
     training_rows: NDArray[np.int64]
     excluded_share: float
@@ -117,7 +115,6 @@ class PassInput:
         if isinstance(aligned, TlsMeasurement) and aligned.scans:
             changes = drop_duplicates(changes)
         registered_residuals, _, noise_ratio = fit_pose_robustly(replace(judged, usable=judged.usable & ~changed))
-        cells = WallCells.over(residuals.wall_xy)
         held_out = held_out_points[residuals.index]
         usable = (
             judged.usable
@@ -134,7 +131,6 @@ class PassInput:
             changed,
             registered_residuals,
             noise_ratio,
-            cells,
             held_out,
             training_rows,
             1 - float(usable.sum()) / max(int(judged.usable.sum()), 1),
@@ -227,11 +223,13 @@ class PassInputs:
     measurement : measurement of N points; the pose of its sensor was estimated without edge effects.
     plain : its residuals without edge effects.
     held_out_points : (N,) true for points that are kept for validation.
+    blocks : the large squares of the wall, each of which is kept for validation, or used in fits, as a whole.
     """
 
     measurement: Measurement
     plain: Residuals
     held_out_points: BoolArray
+    blocks: WallBlocks
 
     @cached_property
     def _without_effects(self) -> PassInput:

@@ -127,7 +127,7 @@ class Validation:
         -------
         tuple : the result with the effects that are kept, and a note for each effect that was dropped.
         """
-        result, words = self._result_of(named, self.tested), []
+        result, words = self._result_of(named), []
         if self.reduced_noise and result.is_worse:
             return replace(self, reduced_noise={}).validate(named)
         while result.is_worse:
@@ -137,7 +137,7 @@ class Validation:
                 break
             out = doubtful[int(np.argmax(harms))]
             words.append(f"{out.name} dropped: the model predicts worse with it")
-            result = self._result_of([item for item in result.named if item is not out], self.tested)
+            result = self._result_of([item for item in result.named if item is not out])
         return result, words
 
     def _harm(self, result: ValidationResult, item: NamedEffect) -> float:
@@ -156,11 +156,13 @@ class Validation:
         """The model with the effects and the reduced noise."""
         return with_effects(self.measurement.model, [item.entry for item in named], self.reduced_noise)
 
-    def _result_of(self, named: list[NamedEffect], rows: BoolArray) -> ValidationResult:
-        """Put the effects into the model and measure the gap on some points (n,)."""
+    def _result_of(self, named: list[NamedEffect]) -> ValidationResult:
+        """Put the effects into the model and measure the gap on the validation points."""
         value, pose = self._registered(named)
         versions = RegisteredModel(self.measurement.model, self.pose), RegisteredModel(self._model(_without_losses(named)), pose)
-        return ValidationResult(named, self.reduced_noise, self._model(named), value, pose, self._gap(named, versions, rows))
+        return ValidationResult(
+            named, self.reduced_noise, self._model(named), value, pose, self._gap(named, versions, self.tested)
+        )
 
     def _registered(self, named: list[NamedEffect]) -> tuple[FloatArray, FloatArray]:
         """Return the residuals (n,) and the pose (6,) after registration with some effects in the model.

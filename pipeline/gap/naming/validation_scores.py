@@ -19,15 +19,13 @@ from pipeline.gap.noise_and_edges.sign_flips import DRAWS
 from pipeline.gap.residuals.alignment import fit_pose
 from pipeline.gap.residuals.correlated_noise import GridCorrelatedNoise, NodeField
 from pipeline.gap.residuals.residuals import BoolArray, Residuals
-from pipeline.gap.residuals.wall_blocks import wall_block_numbers, wall_blocks_by_points
+from pipeline.gap.residuals.wall_blocks import WallBlocks, wall_blocks_by_points
 from pipeline.gap.thresholds import thresholds
 from scene.common.keyed_random import KeyedRandom
 from scene.geometry.mesh import FloatArray
 from sensors.effects.base import ShowsIn
 
 _POINTS_PER_PATCH = 30.0
-_LEAST_WHITE_SHARE = 0.02
-"""Least share of a point's variance that counts as white noise, where the model has correlated noise only."""
 _ROUNDING = 1e-9
 """Relative rounding error of a sum."""
 
@@ -71,7 +69,7 @@ def validate_effects(
     named: list[NamedEffect],
     training: BoolArray,
     reference_sigma: float,
-    side_m: float,
+    blocks: WallBlocks,
 ) -> ValidatedEffects:
     """Test whether each named effect (sensor error) improves the likelihood of parts of the wall that no fit used.
 
@@ -87,8 +85,7 @@ def validate_effects(
     named : effects to validate.
     training : (n,) true for points from which the pose is estimated; the other points, the validation points, are scored.
     reference_sigma : standard deviation of the error of the reference surface, in the unit of the observable (m or px).
-    side_m : a third of the side of a wall block, m. A wall block is a large square of the wall, and is used as a whole for
-        fits or for validation.
+    blocks : the large squares of the wall (wall blocks), each of which is used as a whole for fits or for validation.
 
     Returns
     -------
@@ -102,7 +99,7 @@ def validate_effects(
     with_all = _registered_residuals(measurement, named, residuals, training)
     shared = float(np.mean(residuals.with_sigma_of_means.sigma**2 - residuals.sigma**2)) / _POINTS_PER_PATCH
     patch_sigma = float(np.sqrt(reference_sigma**2 + shared))
-    block = wall_block_numbers(residuals.wall_xy, side_m)
+    block = blocks.numbers(residuals.wall_xy)
 
     def gains(out: Sequence[NamedEffect]) -> FloatArray:
         """Validation gain of some effects in each wall block."""
@@ -110,18 +107,19 @@ def validate_effects(
         known = np.isfinite(with_all.value) & np.isfinite(without.value)
         return _log_score_gains(with_all, without, known & ~training, residuals.wall_xy, block, patch_sigma)
 
-    found = {item.name: gains([item]) for item in scorable}
-    total = {name: float(each.sum()) for name, each in found.items()}
-    strongest_first = sorted((item for item in scorable if not item.adds_variance), key=lambda item: -total[item.name])
+    found = {id(item): gains([item]) for item in scorable}  # two empirical terms may have one name
+    total = {number: float(each.sum()) for number, each in found.items()}
+    strongest_first = sorted((item for item in scorable if not item.adds_variance), key=lambda item: -total[id(item)])
     for group in _groups(strongest_first):
         if gains(group).sum() <= 0:
-            out = min(group, key=lambda item: (item.kind != "empirical", total[item.name]))
+            out = min(group, key=lambda item: (item.kind != "empirical", total[id(item)]))
             rest = [each for each in named if each is not out]
-            left = validate_effects(measurement, residuals, rest, training, reference_sigma, side_m)
+            left = validate_effects(measurement, residuals, rest, training, reference_sigma, blocks)
             return ValidatedEffects(left.named, [out, *left.failed], left.weak)
-    failed = [item for item in scorable if total[item.name] <= item.effect.held_out_gain]
-    measured = [replace(item, gain=total[item.name]) if item.name in total else item for item in named if item not in failed]
-    weak = [item for item in measured if _is_weak(item, found.get(item.name))] if len(measured) > 1 else []
+    failed = [item for item in scorable if total[id(item)] <= item.effect.held_out_gain]
+    kept = [item for item in named if item not in failed]
+    measured = [replace(item, gain=total.get(id(item), item.gain)) for item in kept]
+    weak = [each for each, item in zip(measured, kept, strict=True) if len(kept) > 1 and _is_weak(each, found.get(id(item)))]
     return ValidatedEffects([item for item in measured if item not in weak], failed, weak)
 
 
@@ -165,7 +163,7 @@ def describe_weakness(item: NamedEffect) -> str:
         return "its value is within its uncertainty of zero"
     if item.gain <= thresholds().variance.least_gain:
         return f"it gains only {item.gain:.1f} in log-likelihood on validation blocks"
-    return f"it gains {item.gain:.1f} in log-likelihood on validation blocks, but too few of the blocks gain"
+    return f"it gains {item.gain:.1f} in log-likelihood on validation blocks, but most of that in few blocks"
 
 
 def _is_consistent_with_zero(item: NamedEffect) -> bool:
@@ -199,7 +197,7 @@ class _RegisteredResiduals:
         reference_sigma : standard deviation of the reference error of a patch, in the observable's unit.
         """
         value, sigma = self.value[rows], self.sigma[rows]
-        nodes, own = field.weights, np.maximum(sigma**2 - field.variance, _LEAST_WHITE_SHARE * sigma**2)
+        nodes, own = field.weights, field.white_variance(sigma)
         total = np.bincount(patch, 1 / own)
         mean = np.bincount(patch, value / own) / total
         limit = thresholds().points.outlier_sigmas * sigma

@@ -56,7 +56,7 @@ from pipeline.gap.residuals.stereo_residuals import StereoResiduals, with_surrou
 from pipeline.gap.residuals.subsampling import subsample_measurement
 from pipeline.gap.residuals.surface_residuals import SurfaceResiduals
 from pipeline.gap.residuals.tls_residuals import TlsResiduals, find_expected_pulses, with_scan_order
-from pipeline.gap.residuals.wall_blocks import WallCells, in_validation_blocks, wall_block_numbers
+from pipeline.gap.residuals.wall_blocks import WallBlocks, WallCells
 from pipeline.gap.thresholds import Thresholds, thresholds, use_thresholds
 from scene.common.keyed_random import KeyedRandom
 from scene.geometry.mesh import FloatArray
@@ -165,11 +165,11 @@ def diagnose(
 
 def _diagnose(measurement: Measurement, clock: _Clock, random: KeyedRandom) -> GapDiagnosis:
     """Run the steps of the workflow on the subsampled measurement."""
-    aligned, plain, surveyed, held_out_points = _aligned(measurement)
+    aligned, plain, surveyed, held_out_points, blocks = _aligned(measurement)
     clock.lap("residuals")
     if plain.usable.sum() < thresholds().points.fewest:
         return _insufficient_data(measurement, plain, surveyed, clock)
-    inputs = PassInputs(aligned, plain, held_out_points)
+    inputs = PassInputs(aligned, plain, held_out_points, blocks)
     validated = _select_and_validate(inputs, random)
     clock.lap("naming")
     validated, validation, result, harmful = _with_gap(inputs, validated, random)
@@ -211,18 +211,19 @@ def _diagnose(measurement: Measurement, clock: _Clock, random: KeyedRandom) -> G
     )
 
 
-def _aligned(measurement: Measurement) -> tuple[Measurement, Residuals, FloatArray, BoolArray]:
+def _aligned(measurement: Measurement) -> tuple[Measurement, Residuals, FloatArray, BoolArray, WallBlocks]:
     """Estimate the pose and compute the residuals.
 
     Returns
     -------
-    The measurement at that pose, its residuals, the pose, and the (N,) points of the measurement that are kept for validation.
+    The measurement at that pose, its residuals, the pose, the (N,) points of the measurement that are kept
+    for validation, and the wall blocks to which they belong.
     """
     measurement.check_near(FILE)
     initial = compute_residuals(measurement)
     check_noise("surface" if isinstance(initial, SurfaceResiduals) else initial.sensor, initial.sigma)
-    held_out_points = np.zeros(len(measurement.cloud.points), dtype=bool)
-    held_out_points[initial.index] = in_validation_blocks(initial.wall_xy, WallCells.over(initial.wall_xy).side_m)
+    held_out_points, blocks = np.zeros(len(measurement.cloud.points), dtype=bool), WallCells.over(initial.wall_xy).blocks
+    held_out_points[initial.index] = blocks.for_validation(initial.wall_xy)
     held_out_points |= _in_validation_epoch(measurement.epochs)
     trusted = initial.index[~held_out_points[initial.index]]
     found = align(measurement, trusted, initial)
@@ -233,7 +234,7 @@ def _aligned(measurement: Measurement) -> tuple[Measurement, Residuals, FloatArr
         aligned = with_surroundings(aligned, plain)
     if isinstance(aligned, TlsMeasurement) and isinstance(plain, TlsResiduals):
         plain = replace(plain, expected_pulses=find_expected_pulses(aligned, plain))
-    return aligned, plain, pose, held_out_points
+    return aligned, plain, pose, held_out_points, blocks
 
 
 def _with_gap(
@@ -361,11 +362,11 @@ def _select_and_validate(
     """Select effects and validate them. If an empirical term fails, the selection is repeated without empirical terms."""
     best, aligned = select_beside_edge_effects(inputs, random, excluded), inputs.measurement
     given, selection = best.pass_input, best.selection
-    losses = _explain_losses(aligned, given)
+    losses = _explain_losses(aligned, given, inputs.blocks)
     lost = [effect_from_losses(losses[0], aligned.cloud.intensity)] if losses else []
     named = sorted([*best.named, *map(effect_from_edges, given.edge_effects), *lost], key=lambda item: -item.gain)
     named, words = only_within_bounds(aligned.model, named)
-    scored = _validate(aligned, given, named, selection.reference_sigma).with_needed(selection)
+    scored = _validate(aligned, given, named, selection.reference_sigma, inputs.blocks).with_needed(selection)
     words += [f"{item.name} dropped: it does not improve the validation blocks" for item in scored.failed]
     if NONPARAMETRIC_TERMS not in excluded and _empirical(scored.failed) and _nameable(inputs):
         again = _select_and_validate(inputs, random, excluded | {NONPARAMETRIC_TERMS})
@@ -374,22 +375,24 @@ def _select_and_validate(
     words += [f"{item.name} mentioned but not named: beside the other effects {describe_weakness(item)}" for item in scored.weak]
     rows_of_tails = subsample_rows(np.flatnonzero(given.stable & ~given.held_out))
     fewer, _ = subsample(aligned, given.residuals, rows_of_tails)
-    found, tails = _with_heavy_tails(fewer, scored.named, given.cells.side_m)
+    found, tails = _with_heavy_tails(fewer, scored.named, inputs.blocks)
     words += [tails.note] if tails else []
     return _ValidatedSelection(given, selection, losses, with_separating_measurements(aligned, found), tails, words)
 
 
-def _validate(aligned: Measurement, given: PassInput, named: list[NamedEffect], reference_sigma: float) -> ValidatedEffects:
+def _validate(
+    aligned: Measurement, given: PassInput, named: list[NamedEffect], reference_sigma: float, blocks: WallBlocks
+) -> ValidatedEffects:
     """Score the effects on the validation points."""
     tested = subsample_rows(np.flatnonzero(given.stable & given.held_out))
     rows = np.concatenate([given.training_rows, tested])
     training = np.arange(len(rows)) < len(given.training_rows)
     part = subsample(aligned, given.residuals, rows)
-    return validate_effects(*part, named, training, reference_sigma, given.cells.side_m)
+    return validate_effects(*part, named, training, reference_sigma, blocks)
 
 
 def _with_heavy_tails(
-    measurement: Measurement, named: list[NamedEffect], side_m: float
+    measurement: Measurement, named: list[NamedEffect], blocks: WallBlocks
 ) -> tuple[list[NamedEffect], HeavyTails | None]:
     """Add heavy tails to the named effects if outliers lie all over the wall.
 
@@ -400,7 +403,7 @@ def _with_heavy_tails(
     if any(item.effect is OcclusionFill or item.entry.get("early_share") for item in named):
         return named, None
     part, value, scale = _smooth_residuals_with(measurement, named)
-    tails = find_heavy_tails(value / part.sigma / scale, wall_block_numbers(part.wall_xy, side_m))
+    tails = find_heavy_tails(value / part.sigma / scale, blocks.numbers(part.wall_xy))
     if tails is None or not tails.uniform or not tails.sigma:
         return named, tails
     without_noise = [item for item in named if not item.adds_variance]
@@ -408,7 +411,9 @@ def _with_heavy_tails(
         _, _, core_noise_ratio = _smooth_residuals_with(measurement, without_noise)
         if core_noise_ratio**2 - 1 > thresholds().variance.least_excess:
             return named, tails
-    heavy = effect_from_tails(part, tails.sigma * float(np.median(part.sigma)), tails.gain)
+    part, _, scale = _smooth_residuals_with(measurement, without_noise)
+    added = scale**2 * (1 + tails.sigma**2) - 1  # `find_heavy_tails` was given residuals over `scale` times the predicted sigma
+    heavy = effect_from_tails(part, float(np.sqrt(added) * np.median(part.sigma)), tails.gain)
     return [*without_noise, *only_within_bounds(measurement.model, [heavy])[0]], tails
 
 
@@ -479,13 +484,13 @@ def _insufficient_data(measurement: Measurement, residuals: Residuals, pose: Flo
     )  # fmt: skip
 
 
-def _explain_losses(measurement: Measurement, given: PassInput) -> tuple[LossExplanation, BoolArray] | None:
+def _explain_losses(measurement: Measurement, given: PassInput, blocks: WallBlocks) -> tuple[LossExplanation, BoolArray] | None:
     """Explain the missing returns, with the pulses that the explanation was not fitted to."""
     residuals = given.residuals
     missing = residuals.expected_pulses
     if missing is None or any(model_has(measurement, name) for name in LOSS_EFFECTS):
         return None
-    held_out = in_validation_blocks(missing.wall_xy, given.cells.side_m)
+    held_out = blocks.for_validation(missing.wall_xy)
     early = residuals.usable & ~given.changed & (given.registered_residuals < -thresholds().missing_returns.early_m)
     drops = count_isolated_returns(residuals.wall_xy, early)
     found = explain_missing_returns(missing, ~held_out, drops, len(residuals), measurement.cloud.intensity)

@@ -190,8 +190,8 @@ def separate_white_and_grid_noise(
     -------
     list : the noise terms, white or grid-correlated, that the semivariogram supports.
     """
-    named = [_name_noise(replace(each, name=each.effect, empirical=False), part, value, model) for each in found]
-    return [old if old.empirical and new.name == old.effect else new for old, new in zip(found, named, strict=True)]
+    named = [_name_noise(replace(each, empirical=False), part, value, model) for each in found]
+    return [old if old.empirical and new.effect == old.effect else new for old, new in zip(found, named, strict=True)]
 
 
 def find_grid_noise(
@@ -225,7 +225,7 @@ def find_grid_noise(
     if fit.chi2 >= without - needed:
         return None, _describe_reference_error(fit, step, variogram.unit_m)
     name, p_value = RegularizationNoise.tag(), variogram.p_value(random)
-    found = VarianceTerm(name, name, (), p_value, (without - fit.chi2) / 2, {}, {}, False, np.zeros(len(part)))
+    found = VarianceTerm(name, (), p_value, (without - fit.chi2) / 2, {}, {}, False, np.zeros(len(part)))
     return _as_grid_noise(found, fit, step, near), ""
 
 
@@ -255,7 +255,7 @@ def _name_noise(white: VarianceTerm, part: StereoResiduals, value: FloatArray, m
         return white
     if best[0].variance <= 0 or white_fit.chi2 < best[0].chi2 + thresholds().mean.class_margin:
         return both
-    grid = replace(white, name=RegularizationNoise.tag(), effect=RegularizationNoise.tag(), indistinguishable=())
+    grid = replace(white, effect=RegularizationNoise.tag(), indistinguishable=())
     return _as_grid_noise(grid, *best)
 
 

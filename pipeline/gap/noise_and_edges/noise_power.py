@@ -13,7 +13,7 @@ from pipeline.gap.noise_and_edges.sign_flips import null_critical_score
 from pipeline.gap.noise_and_edges.variance_fit import VarianceCandidate
 from pipeline.gap.noise_and_edges.variance_model import standardised_deviations, variance_candidates
 from pipeline.gap.residuals.residuals import Residuals
-from pipeline.gap.residuals.wall_blocks import WallCells, wall_block_numbers
+from pipeline.gap.residuals.wall_blocks import WallCells
 from pipeline.gap.thresholds import thresholds
 from scene.common.keyed_random import KeyedRandom
 from scene.geometry.mesh import FloatArray
@@ -52,7 +52,7 @@ def detectable_noise(
         return []
     used = np.isfinite(z) & (np.abs(z) < thresholds().points.outlier_sigmas * max(1.0, nmad(z, 0.0)))
     squares = z[used] ** 2 / float(np.mean(z[used] ** 2))
-    block = np.unique(wall_block_numbers(residuals.wall_xy[used], cells.side_m), return_inverse=True)[1]
+    block = np.unique(cells.blocks.numbers(residuals.wall_xy[used]), return_inverse=True)[1]
     shapes = [(each.variance[used] / residuals.sigma[used, None] ** 2).sum(axis=1) for each in candidates]
     critical = null_critical_score(squares, shapes, block, random)
     missing = 1 - min(float(np.mean(z[used] ** 2)), 1.0)

@@ -16,7 +16,7 @@ from pipeline.change.robust import nmad
 from pipeline.gap.noise_and_edges.sign_flips import null_p_value
 from pipeline.gap.noise_and_edges.variance_fit import BinnedVariance, VarianceCandidate, VarianceFit, best_binned_variance
 from pipeline.gap.residuals.residuals import BoolArray, Geometry, Residuals
-from pipeline.gap.residuals.wall_blocks import WallCells, wall_block_numbers
+from pipeline.gap.residuals.wall_blocks import WallCells
 from pipeline.gap.thresholds import equivalence_margin, thresholds
 from scene.common.keyed_random import KeyedRandom
 from scene.geometry.mesh import FloatArray
@@ -24,8 +24,8 @@ from sensors.effects.base import Effect, ShowsIn
 
 _LEAST_REMAINING_VARIANCE = 0.3
 """Least share of a point's variance that the plane of its cell must leave."""
-_LEAST_WHITE_SHARE, _EXPECTATION_DRAWS = 0.02, 10
-"""Least share of a point's variance that counts as white noise; number of simulations of correlated noise."""
+_EXPECTATION_DRAWS = 10
+"""Number of simulations of correlated noise."""
 _CLIP_SIGMAS = 12.0
 """Standard deviations at which outliers are clipped."""
 _HIGHEST_QUANTILE = 0.999
@@ -38,7 +38,6 @@ class VarianceTerm:
 
     Attributes
     ----------
-    name : name of the noise effect; for an empirical term, the covariate on which the variance depends.
     effect : name of the effect of the catalogue that represents the term in a sensor model.
     indistinguishable : names of other effects that would explain the variance as well.
     p_value : p-value from the simulated null distribution.
@@ -48,7 +47,6 @@ class VarianceTerm:
     variance : (n,) variance that it adds at each point, squared unit of the observable (m² or px²).
     """
 
-    name: str
     effect: str
     indistinguishable: tuple[str, ...]
     p_value: float
@@ -188,8 +186,8 @@ def fit_variance_model(
     if not seen.free_form_fits_better(free, chosen):
         return seen.terms(chosen, pairs, p_value), tried, ""
     if free.score - chosen.score > by.nonparametric_share * chosen.gain:
-        named = [replace(each, name=f"variance by {free.name}", empirical=True) for each in seen.terms(best, pairs, p_value)]
-        return named, tried, ""
+        named = [replace(each, empirical=True) for each in seen.terms(best, pairs, p_value)]
+        return named, tried, f"the noise varies with {free.name} as no effect of the catalogue does"
     note = f"the noise also varies with {free.name}, which no effect of the catalogue explains"
     return seen.terms(chosen, pairs, p_value), tried, note
 
@@ -229,7 +227,7 @@ class _SquaredDeviations:
             squares = (z * weighted.sigma)[used] ** 2 / predicted[used]
             shapes = [candidate.variance[used] / predicted[used, None] for candidate in candidates]
             singles = [VarianceFit.fitted(squares, shapes, [number], candidates) for number in range(len(shapes))]
-            return cls(candidates, used, squares, shapes, wall_block_numbers(residuals.wall_xy[used], cells.side_m), singles)
+            return cls(candidates, used, squares, shapes, cells.blocks.numbers(residuals.wall_xy[used]), singles)
 
         first = deviations(residuals)
         if first is None:
@@ -290,7 +288,6 @@ class _SquaredDeviations:
         near = {self.candidates[n].name for fit in others if fit.score > chosen.score - margin for n in fit.members}
         alone = (fit.gain for fit in self.singles if fit.members != (number,) and fit.members[0] in chosen.members)
         return VarianceTerm(
-            name=candidate.name,
             effect=candidate.name,
             indistinguishable=tuple(sorted(near - {self.candidates[each].name for each in chosen.members})),
             p_value=p_value,
@@ -366,9 +363,7 @@ class NoiseRatio:
         if not used.any():
             return cls(1.0, False)
         squares = np.minimum(z[used] ** 2, _CLIP_SIGMAS**2) / _expected_mean_square(residuals, cells, random)
-        means = np.bincount(
-            np.unique(wall_block_numbers(residuals.wall_xy[used], cells.side_m), return_inverse=True)[1], squares - 1
-        )
+        means = np.bincount(np.unique(cells.blocks.numbers(residuals.wall_xy[used]), return_inverse=True)[1], squares - 1)
         below = float(means.sum()) < -thresholds().edges.block_sigmas * float(np.linalg.norm(means))
         return cls(float(np.sqrt(squares.mean())), below)
 
@@ -389,7 +384,7 @@ def _expected_mean_square(residuals: Residuals, cells: WallCells, random: KeyedR
     field = residuals.correlated_noise.node_field(len(residuals))
     if not field.weights.shape[1]:
         return 1.0
-    own = np.sqrt(np.maximum(residuals.sigma**2 - field.variance, _LEAST_WHITE_SHARE * residuals.sigma**2))
+    own = np.sqrt(field.white_variance(residuals.sigma))
     root, draws = np.linalg.cholesky(field.covariance), random.child("share").generator()
     squares = []
     for _ in range(_EXPECTATION_DRAWS):

@@ -22,6 +22,8 @@ _MOST_NODES = 2500
 """Most nodes. A finer grid is replaced by a coarser one with the same power at long wavelengths."""
 _SAMPLE = 500
 """Points over which the variance is averaged."""
+_LEAST_WHITE_SHARE = 0.02
+"""Least share of a point's variance that counts as white noise."""
 _RIDGE = 1e-4
 """Share of a node's variance that is added to the diagonal of the covariance, to keep it positive definite."""
 _REACH = 2.5
@@ -63,6 +65,13 @@ class NodeField:
         """
         some = self.weights[:: max(self.weights.shape[0] // _SAMPLE, 1)]
         return float(np.mean((some @ self.covariance * some.toarray()).sum(axis=1))) if some.shape[1] else 0.0
+
+    def white_variance(self, sigma: FloatArray) -> FloatArray:
+        """Return the variance (n,) of the noise that neighbours do not share, px², at least 2 % of the whole one.
+
+        sigma: (n,) predicted standard deviations of the points, px. A model may have grid-correlated noise only.
+        """
+        return np.asarray(np.maximum(sigma**2 - self.variance, _LEAST_WHITE_SHARE * sigma**2))
 
 
 @dataclass(frozen=True)

@@ -17,8 +17,45 @@ _MOST_CELLS = 800
 """Most cells, so that a dense covariance of their means stays small."""
 _FEWEST_POINTS = 3
 """Fewest points in a cell that is used."""
-BLOCK_CELLS = 3
+_BLOCK_CELLS = 3
 """Side of a wall block in cells."""
+_ROWS_APART = 100_000
+"""Difference of the numbers of a wall block and of the one above it; no wall has as many in a row."""
+
+
+@dataclass(frozen=True)
+class WallBlocks:
+    """Large squares of the wall, for spatial cross-validation and for resampling.
+
+    Errors may be correlated within a wall block, so all its points are used together, either for fitting or for validation.
+
+    Attributes
+    ----------
+    origin : (2,) lower left corner of the squares, x along the wall and y up, wall frame, m.
+    side_m : side of a square, m.
+    """
+
+    origin: FloatArray
+    side_m: float
+
+    def numbers(self, at: FloatArray) -> NDArray[np.int64]:
+        """Return the number of the wall block in which each point lies; the numbers are not consecutive.
+
+        at: (n, 2) positions of the points, x along the wall and y up, wall frame, m. A point has the same number (n,) whichever
+        other points are given with it.
+        """
+        column, row = np.floor((at - self.origin) / self.side_m).astype(np.int64).T
+        return np.asarray(column + _ROWS_APART * row)
+
+    def for_validation(self, at: FloatArray) -> NDArray[np.bool_]:
+        """Tell which points (n,) are kept for validation and must not be used in any fit: those in every fifth wall block.
+
+        The blocks kept are spread over the wall like knight's moves in chess.
+
+        at: (n, 2) positions of the points, x along the wall and y up, wall frame, m.
+        """
+        block = self.numbers(at)
+        return np.asarray((block % _ROWS_APART + 2 * (block // _ROWS_APART)) % 5 == 0)
 
 
 @dataclass(frozen=True)
@@ -30,11 +67,13 @@ class WallCells:
     side_m : Side of a square (cell), m.
     cell : (n,) number of the cell in which each point lies; -1 for cells with fewer than three points, which are not used.
     centre : (m, 2) mean position of the points in each of the m used cells, x along the wall and y up, wall frame, m.
+    origin : (2,) lower left corner of the squares, wall frame, m.
     """
 
     side_m: float
     cell: NDArray[np.int64]
     centre: FloatArray
+    origin: FloatArray
 
     @classmethod
     def over(cls, at: FloatArray) -> WallCells:
@@ -43,37 +82,23 @@ class WallCells:
         at: (n, 2) positions of the points to be covered, x along the wall and y up, wall frame, m.
         """
         side = float(np.sqrt(np.prod(np.ptp(at, axis=0)) / _MOST_CELLS)) or 1.0
-        column, row = (np.floor((at[:, axis] - at[:, axis].min()) / side).astype(np.int64) for axis in (0, 1))
-        _, number, counts = np.unique(column + 100_000 * row, return_inverse=True, return_counts=True)
+        origin = at.min(axis=0)
+        _, number, counts = np.unique(WallBlocks(origin, side).numbers(at), return_inverse=True, return_counts=True)
         kept = counts >= _FEWEST_POINTS
         renumbered = np.where(kept, np.cumsum(kept) - 1, -1)[number]
         inside = renumbered >= 0
         total = int(kept.sum())
         size = np.maximum(np.bincount(renumbered[inside], minlength=total), 1)
         centre = np.stack([np.bincount(renumbered[inside], at[inside, axis], total) / size for axis in (0, 1)], axis=1)
-        return cls(side, renumbered, centre)
+        return cls(side, renumbered, centre, origin)
 
     def __len__(self) -> int:
         return len(self.centre)
 
-
-def wall_block_numbers(at: FloatArray, side_m: float) -> NDArray[np.int64]:
-    """Return the number of the wall block in which each point lies, for spatial cross-validation.
-
-    A wall block is a large square of the wall: 3 by 3 of the cells over which residuals are averaged. Errors may be correlated
-    within it, so all its points are used together, either for fitting or for validation.
-
-    Parameters
-    ----------
-    at : (n, 2) positions of the points, x along the wall and y up, wall frame, m.
-    side_m : Side of a cell, m: a third of the side of a wall block.
-
-    Returns
-    -------
-    (n,) numbers; they are not consecutive.
-    """
-    column, row = (np.floor((at[:, axis] - at[:, axis].min()) / (BLOCK_CELLS * side_m)).astype(np.int64) for axis in (0, 1))
-    return column + 100_000 * row
+    @property
+    def blocks(self) -> WallBlocks:
+        """The wall blocks: squares of 3 by 3 cells, each of which is used as a whole, for fits or for validation."""
+        return WallBlocks(self.origin, _BLOCK_CELLS * self.side_m)
 
 
 def wall_blocks_by_points(at: FloatArray, points: float) -> NDArray[np.int64]:
@@ -89,23 +114,4 @@ def wall_blocks_by_points(at: FloatArray, points: float) -> NDArray[np.int64]:
     (n,) number of the wall block in which each point lies, counted from 0.
     """
     side = float(np.sqrt(np.prod(np.ptp(at, axis=0)) / max(len(at) / points, 1.0))) or 1.0
-    column, row = (np.floor((at[:, axis] - at[:, axis].min()) / side).astype(np.int64) for axis in (0, 1))
-    return np.asarray(np.unique(column + 100_000 * row, return_inverse=True)[1])
-
-
-def in_validation_blocks(at: FloatArray, side_m: float) -> NDArray[np.bool_]:
-    """Tell which points are kept for validation and must not be used in any fit: those in every fifth wall block.
-
-    A wall block is a large square of the wall. The blocks kept are spread over the wall like knight's moves in chess.
-
-    Parameters
-    ----------
-    at : (n, 2) positions of the points, x along the wall and y up, wall frame, m.
-    side_m : A third of the side of a wall block, m.
-
-    Returns
-    -------
-    (n,) true for validation points.
-    """
-    block = wall_block_numbers(at, side_m)
-    return np.asarray((block % 100_000 + 2 * (block // 100_000)) % 5 == 0)
+    return np.asarray(np.unique(WallBlocks(at.min(axis=0), side).numbers(at), return_inverse=True)[1])
