@@ -14,6 +14,7 @@ from pipeline.gap.mean.selection import FamilyScore, SelectedEffect
 from pipeline.gap.naming import nonlinear_refit
 from pipeline.gap.naming.named_effects import Estimate
 from pipeline.gap.naming.nonlinear_refit import (
+    _best_variants,
     _ExplanationFit,
     _gain_over,
     _ranked_on_common_points,
@@ -53,6 +54,14 @@ def test_a_fit_that_leaves_out_outliers_is_not_favoured() -> None:
     assert [each.name for each in ranked] == ["trunnion_tilt", "tilt_drift"]
     assert _gain_over(keeps, leaves_out, CHI2) == pytest.approx(1.5)
     assert _with_equivalence_class(ranked).estimate.chosen.indistinguishable == ("tilt_drift",)
+
+
+def test_effects_that_leave_out_points_do_not_keep_a_better_one_from_being_refitted(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Three effects leave out the second point, where the fourth is wrong by 5, and are worse than it at the first."""
+    monkeypatch.setattr(nonlinear_refit, "_converged", lambda _given, _first, each: each)
+    found = [*(fit(name, [2.0, 0.0], [True, False]) for name in "abc"), fit("d", [1.0, 5.0], [True, True])]
+    given: Any = None
+    assert _best_variants(given, CHI2, found)[0].name == "d"
 
 
 def test_clearly_different_fits_are_no_class() -> None:

@@ -31,7 +31,7 @@ from pipeline.gap.naming.nonlinear_refit import (
     _with_equivalence_class,
     select_and_refit,
 )
-from pipeline.gap.naming.search_beside_effects import fit_jointly, search_at_joint_fit
+from pipeline.gap.naming.search_beside_effects import _JointFit, fit_jointly, search_at_joint_fit
 from pipeline.gap.naming.search_outcome import SearchInput, SearchOutcome
 from pipeline.gap.naming.search_residuals import with_fitted_variance
 from pipeline.gap.naming.selection_passes import PassInput, PassInputs
@@ -133,6 +133,28 @@ def test_slopes_are_the_true_ones_where_all_effects_together_fit_best(
     assert fit_reml is not None
     there, at, explained = fit_reml
     assert max(both(candidate_families(there, at), at, at.value + explained)) < 0.15
+
+
+@pytest.mark.parametrize(("squares", "kept"), [((4.0, 2.0, 3.0), 2.0), ((4.0, 3.99), 3.99)])
+def test_a_joint_fit_ends_with_its_best_step(monkeypatch: pytest.MonkeyPatch, squares: tuple[float, ...], kept: float) -> None:
+    """A step that makes the residuals larger is dropped; one that makes them smaller by 0.3 % is the last one."""
+
+    def step(square: float) -> Any:
+        coming = iter(squares[squares.index(square) + 1 :] if square in squares else squares)
+        return SimpleNamespace(
+            mean_square=square,
+            residuals=square,
+            measurement=None,
+            candidates=[SimpleNamespace(columns=np.zeros((1, 1)))],
+            values=np.zeros(1),
+            improved=lambda _: step(next(coming)),
+        )
+
+    monkeypatch.setattr(_JointFit, "nothing_of", lambda *_: step(np.inf))
+    given: Any = None
+    fitted = fit_jointly(given, [])
+    assert fitted is not None
+    assert fitted[1] == kept
 
 
 def test_noise_beside_effects_is_asked_for_with_these_in_the_model(
@@ -291,6 +313,10 @@ def test_the_effect_that_leaves_the_least_noise_ranks_first(tmp_path: Path, monk
     search = MeanSearch(part, candidate_families(there, part), KeyedRandom(1))
     tried = [each for each in search.effect_variants() if each.name in {"principal_point_x", "focal_length", "radial_distortion"}]
     assert len(tried) == 9  # each in the left camera, in the right one and in both
+    best = {each.name: each for each in search.score_families(())}
+    for each in tried:
+        lead = best[each.name].score - search.score_alone(each)
+        assert lead == pytest.approx(0.0) if each is best[each.name].candidate else lead > 0
     ranked = screen_effects(there, part, tried[::-1], 9)
     assert {(each.candidate.name, each.candidate.fixed["camera"]) for each in ranked[:2]} == {
         ("principal_point_x", "left"),
@@ -404,3 +430,18 @@ def test_an_effect_from_which_few_blocks_gain_is_only_mentioned_beside_others(tm
     assert [item.name for item in both.named] == ["tls.range_incidence_bias"]
     assert [item.name for item in both.weak] == ["tls.range_scale"]
     assert 0 < both.weak[0].gain < 2
+
+
+def test_of_two_curves_with_one_name_only_the_wrong_one_fails(tmp_path: Path) -> None:
+    """The ranges grow with the incidence angle, as one curve says; the other one moves ranges where there is no error."""
+    write_scan(tmp_path, 8, ranges=lambda scan: scan.R + 0.01 * (1 / scan.cos_i - 1), step_rad=0.007)
+    there, residuals, _ = align(read_measurement(tmp_path))
+    blocks = WallCells.over(residuals.wall_xy).blocks
+    incidence = np.linspace(0.0, 1.4, 141)
+    shapes = (0.01 * (1 / np.cos(incidence) - 1), 0.003 * np.sin(9 * incidence))
+    along = {"covariate": "incidence", "along": {"low": 0.0, "high": 1.4}}
+    entries = [{"name": "range_empirical", **along, "values_m": [shape.tolist()]} for shape in shapes]
+    true, wrong = (NamedEffect("tls.range_empirical", "empirical", entry, {}, (), 0.001, 9.0) for entry in entries)
+    scored = validate_effects(there, residuals, [true, wrong], ~blocks.for_validation(residuals.wall_xy), 0.0004, blocks)
+    assert [item.entry for item in scored.named] == [true.entry]
+    assert [item.entry for item in scored.failed] == [wrong.entry]

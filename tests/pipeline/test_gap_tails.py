@@ -9,10 +9,12 @@ import numpy as np
 import pytest
 
 from pipeline.gap.mean.selection import SelectedEffect
-from pipeline.gap.naming import effect_selection
+from pipeline.gap.naming import effect_selection, workflow
 from pipeline.gap.naming.effect_selection import keep_implausible_in_class
 from pipeline.gap.naming.named_effects import NamedEffect, absorbed_by_registration
 from pipeline.gap.noise_and_edges.heavy_tails import find_heavy_tails
+from pipeline.gap.residuals.wall_blocks import WallBlocks
+from sensors.effects.range_noise import RangeNoise
 
 POINTS, BLOCKS = 30_000, 100
 
@@ -39,6 +41,31 @@ def test_where_far_points_lie_says_whose_they_are(uneven: bool) -> None:
     assert found.share == pytest.approx(0.03 * 0.689, rel=0.15)
     assert ("all over the wall" in found.note) is not uneven
     assert f"{100 * found.share:.2g} % of the points lie beyond 4 predicted standard deviations" in found.note
+
+
+@pytest.mark.parametrize(("named", "base"), [(False, 0.002), (True, 0.001)])
+def test_noise_for_far_points_explains_the_scatter_of_all(monkeypatch: pytest.MonkeyPatch, named: bool, base: float) -> None:
+    """Noise added to that of the model without a noise term gives the standard deviation of the residuals.
+
+    They are predicted with 2 mm; the core has 3 mm, and 3 % are ten times as wide. A noise term that is named explains the core
+    down to 1 mm, and is replaced.
+    """
+    z, block = _residuals(0.03, False)
+    at = np.stack([block + 0.5, np.full(POINTS, 0.5)], axis=1)
+
+    def smooth(_: Any, effects: list[NamedEffect]) -> tuple[Any, np.ndarray, float]:
+        without_term = named and not effects
+        sigma = np.full(POINTS, base if without_term else 0.002)
+        part = SimpleNamespace(sigma=sigma, wall_xy=at, sensor="tls", white_noise=(RangeNoise, "sigma_m"))
+        return part, 0.003 * z, 1.0 if without_term else 1.5
+
+    monkeypatch.setattr(workflow, "_smooth_residuals_with", smooth)
+    monkeypatch.setattr(workflow, "only_within_bounds", lambda _, effects: (effects, []))
+    noise = [NamedEffect("tls.range_noise_incidence", "physical", {"name": "range_noise_incidence"}, {}, (), None, 9.0)] * named
+    there: Any = SimpleNamespace(model=None)
+    (heavy,), _ = workflow._with_heavy_tails(there, noise, WallBlocks(np.zeros(2), 1.0))
+    scatter = 0.003 * np.sqrt(np.mean(np.minimum(z**2, 144.0)))
+    assert np.hypot(base, heavy.entry["sigma_m"]) == pytest.approx(scatter, rel=1e-6)
 
 
 def test_what_far_points_gain_is_a_log_likelihood_and_not_their_number() -> None:

@@ -406,14 +406,13 @@ def _with_heavy_tails(
     tails = find_heavy_tails(value / part.sigma / scale, blocks.numbers(part.wall_xy))
     if tails is None or not tails.uniform or not tails.sigma:
         return named, tails
+    total = scale**2 * (1 + tails.sigma**2) * np.median(part.sigma) ** 2
     without_noise = [item for item in named if not item.adds_variance]
     if len(without_noise) < len(named):
-        _, _, core_noise_ratio = _smooth_residuals_with(measurement, without_noise)
+        part, _, core_noise_ratio = _smooth_residuals_with(measurement, without_noise)
         if core_noise_ratio**2 - 1 > thresholds().variance.least_excess:
             return named, tails
-    part, _, scale = _smooth_residuals_with(measurement, without_noise)
-    added = scale**2 * (1 + tails.sigma**2) - 1  # `find_heavy_tails` was given residuals over `scale` times the predicted sigma
-    heavy = effect_from_tails(part, float(np.sqrt(added) * np.median(part.sigma)), tails.gain)
+    heavy = effect_from_tails(part, float(np.sqrt(total - np.median(part.sigma) ** 2)), tails.gain)
     return [*without_noise, *only_within_bounds(measurement.model, [heavy])[0]], tails
 
 
