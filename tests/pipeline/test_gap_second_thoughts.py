@@ -20,9 +20,10 @@ from benchmarks.gap_closed_form.cases import Case, make
 from pipeline.formats.measurements.measurement import StereoMeasurement, read_measurement
 from pipeline.gap.mean.nonparametric_terms import SPATIAL_NULL
 from pipeline.gap.naming import selection_passes, workflow
-from pipeline.gap.naming.effect_selection import NONPARAMETRIC_TERMS, _note_most_similar
+from pipeline.gap.naming.effect_selection import NONPARAMETRIC_TERMS
 from pipeline.gap.naming.gap_score import simulate_errors
 from pipeline.gap.naming.named_effects import NamedEffect, with_effects
+from pipeline.gap.naming.selection_notes import _note_most_similar
 from pipeline.gap.naming.selection_passes import PassInput, PassInputs, SelectionPass, select_beside_edge_effects
 from pipeline.gap.naming.validation import Validation, ValidationResult
 from pipeline.gap.naming.validation_scores import ValidatedEffects

@@ -13,12 +13,11 @@ from pipeline.change.robust import nmad
 from pipeline.formats.measurements.measurement import Measurement, StereoMeasurement
 from pipeline.gap.mean.candidates import Candidate, SineGrid
 from pipeline.gap.mean.detection_power import DetectableSize
-from pipeline.gap.mean.nonparametric_terms import LINE_PATTERN, SPATIAL_NULL
+from pipeline.gap.mean.nonparametric_terms import SPATIAL_NULL
 from pipeline.gap.mean.search import MeanSearch
 from pipeline.gap.mean.selection import FamilyScore, SelectedEffect
 from pipeline.gap.naming.candidate_families import candidate_families, model_has
 from pipeline.gap.naming.named_effects import (
-    Estimate,
     NamedEffect,
     absorbed_by_registration,
     aligned_with,
@@ -35,11 +34,12 @@ from pipeline.gap.naming.nonlinear_refit import select_and_refit
 from pipeline.gap.naming.search_beside_effects import repeat_search
 from pipeline.gap.naming.search_outcome import SearchInput, SearchOutcome
 from pipeline.gap.naming.search_residuals import with_added_variance, with_fitted_variance
+from pipeline.gap.naming.selection_notes import note_left_out, notes_on_outcome
 from pipeline.gap.noise_and_edges.grid_noise import find_grid_noise, separate_white_and_grid_noise
 from pipeline.gap.noise_and_edges.noise_power import detectable_noise
 from pipeline.gap.noise_and_edges.pixel_locking import Locking, NoiseBounds, find_locking
 from pipeline.gap.noise_and_edges.rounded_ranges import find_range_step
-from pipeline.gap.noise_and_edges.tile_seams import detectable_tile_shift, find_tile_seams
+from pipeline.gap.noise_and_edges.tile_seams import UnequalTiles, detectable_tile_shift, find_tile_seams, find_unequal_tiles
 from pipeline.gap.noise_and_edges.variance_model import NoiseRatio, VarianceScore, VarianceTerm, fit_variance_model
 from pipeline.gap.residuals.alignment import at_points_of, fit_pose_robustly
 from pipeline.gap.residuals.residuals import Residuals
@@ -329,7 +329,7 @@ def _result(
 ) -> SelectionResult:
     """Return the scores and tests of a selection; left: (n,) residuals after its systematic effects; systematic: their names."""
     design, sensor = found.search.design, given.part.sensor
-    said = (*_note_repetition(found.estimates), *_note_oblique_waves(found), *_note_most_similar(found, given.part))
+    tiles = _unequal_tiles(given, found, left)
     alone = first.score_families(()) if found.estimates else ()
     names, cosines, survival = first.design.identifiability()
     tried = found.chosen[0].family_scores if found.chosen else found.tried
@@ -337,12 +337,17 @@ def _result(
         tried=tuple(item for item in tried if not item.name.startswith(SPATIAL_NULL)),
         variance_tried=tuple(noise.tried),
         systematic=systematic,
-        p_value=found.p_value,
-        p_without_effects=first.goodness_of_fit_p_value(alone) if alone else found.p_value,
+        p_value=_at_most(found.p_value, tiles),
+        p_without_effects=_at_most(first.goodness_of_fit_p_value(alone) if alone else found.p_value, tiles),
         unexplained_noise=(
             NoiseRatio(1.0, False) if noise.terms else NoiseRatio.of(found.residuals, design.cells, left, given.random)
         ),
-        notes=(*given.part.notes, *_note_left_out(given.excluded), *filter(None, [noise.note]), *said),
+        notes=(
+            *given.part.notes,
+            *note_left_out(given.excluded - {NONPARAMETRIC_TERMS}),
+            *filter(None, [noise.note, tiles.note if tiles else ""]),
+            *notes_on_outcome(found, given.part),
+        ),
         identifiability={
             "names": [f"{sensor}.{name}" for name in names],
             "cosines": cosines.tolist(),
@@ -350,8 +355,23 @@ def _result(
         },
         reference_sigma=design.reference_sigma([each.candidate for each in found.further]),
         detectable=lambda: _detectable_sizes(found, [each.effect for each in noise.terms], left, given.random),
-        p_value_beside=cache(lambda kept: _p_value_beside(search, found, kept)),
+        p_value_beside=cache(lambda kept: _at_most(_p_value_beside(search, found, kept), tiles)),
     )
+
+
+def _unequal_tiles(given: SelectionInput, found: SearchOutcome, left: FloatArray) -> UnequalTiles | None:
+    """Tiles of the image that are shifted by unequal amounts, where no other effect of the catalogue makes jumps.
+
+    Rounding and locking of disparities make jumps too. left: (n,) residuals after the systematic effects.
+    """
+    known = any(model_has(given.measurement, effect.tag()) for effect in (TileShift, PixelLocking))
+    stereo = found.residuals if isinstance(found.residuals, StereoResiduals) else None
+    return None if stereo is None or known else find_unequal_tiles(stereo, left)
+
+
+def _at_most(p_value: float | None, tiles: UnequalTiles | None) -> float | None:
+    """The p-value of a misfit, or that of shifted tiles if it is smaller."""
+    return p_value if tiles is None else min(1.0 if p_value is None else p_value, tiles.p_value)
 
 
 def _p_value_beside(points: SearchInput, found: SearchOutcome, kept: frozenset[str]) -> float | None:
@@ -454,47 +474,3 @@ def _beside(given: SelectionInput, named: list[NamedEffect]) -> SelectionInput:
     at = at_points_of(found, given.part)
     ratio = fit_pose_robustly(at)[2]
     return replace(given, measurement=aligned, part=at, noise_ratio=ratio, noise=None, grid_noise=None)
-
-
-def _note_repetition(estimates: list[Estimate]) -> list[str]:
-    """Return remarks for the report on terms that repeat after a few scan lines."""
-    lines = [each.candidate.fixed["lines"] for each in estimates if each.candidate.form.startswith(LINE_PATTERN)]
-    return [
-        f"the empirical term repeats after exactly {each} lines: think of the facets of a mirror, or of a read-out in blocks"
-        for each in lines
-    ]
-
-
-def _note_most_similar(found: SearchOutcome, part: Residuals) -> list[str]:
-    """Note on the best candidate where a misfit is left and nothing was accepted."""
-    if found.estimates or found.p_value is None or found.p_value > thresholds().verdict.rejection_p:
-        return []
-    best = max((item for item in found.tried if not item.name.startswith(SPATIAL_NULL)), key=lambda item: item.score)
-    what = f"a change with {best.name} ({best.candidate.form})" if best.empirical else best.name
-    size = 1e3 * found.search.fitted_std(best) * float(np.median(part.unit_m))
-    return [
-        f"the remaining misfit is most similar to {what}, {size:.2g} mm (standard deviation). A reference that errs along whole "
-        "lines or columns, as in strips, looks the same; a scan from another station would separate the two"
-    ]
-
-
-def _note_oblique_waves(found: SearchOutcome) -> list[str]:
-    """Note on oblique waves on the wall that the error model of the reference does not explain."""
-    p_value = found.search.spatial_null_p_value(found.tried)
-    if p_value is None or p_value > thresholds().verdict.rejection_p:
-        return []
-    return [
-        f"the residuals contain waves at an oblique angle that the reference's error model does not explain (p = {p_value:.2g}). "
-        "No sensor effect is aligned like that; they are attributed to the reference"
-    ]
-
-
-def _note_left_out(excluded: frozenset[tuple[str, bool]]) -> list[str]:
-    """Return remarks for the report on families of effects that were not tried."""
-    out = sorted(excluded - {NONPARAMETRIC_TERMS})
-    said = (f"non-parametric terms of {name}" if empirical else name for name, empirical in out)
-    why = (
-        "its best value is outside the bounds of the effect, or it is many typical sizes, the registration absorbs nearly all "
-        "of it, and a misfit is left"
-    )
-    return [f"{what} left out: {why}" for what in said]

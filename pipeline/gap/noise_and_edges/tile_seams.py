@@ -1,7 +1,8 @@
 """Find tiles of a stereo matcher that are shifted against each other, by the differences of neighbours on both sides of a seam.
 
 For a checkerboard of amplitude A, the difference of two neighbouring cells is +-2 A across a seam and 0 elsewhere, whatever the
-pose and the smooth error of the reference are. Every side of a tile is tried.
+pose and the smooth error of the reference are. Every side of a tile is tried. Tiles that are each shifted by a random amount make
+differences across seams larger than elsewhere.
 """
 
 from __future__ import annotations
@@ -10,7 +11,8 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import norm
+from scipy.special import ndtri
+from scipy.stats import norm, rankdata
 
 from pipeline.change.robust import nmad
 from pipeline.gap.mean.detection_power import POWER, DetectableSize
@@ -29,6 +31,9 @@ _CLIP_SIGMAS = 4.0
 """Standard deviations at which differences are clipped, because of depth steps."""
 _AT_ONCE, _REFINED = 512, 201
 """Sides that are tried together, and sides that are tried around the best one."""
+_FEWEST_SEAMS, _EVERY = 3, 2
+"""Fewest seams by which tiles with unequal shifts are told from a single edge on the wall; such tiles are tried with every second
+side, which moves the last seam by half a cell."""
 
 
 @dataclass(frozen=True)
@@ -115,9 +120,10 @@ class _SeamTest:
 
 
 def find_tile_seams(residuals: StereoResiduals, registered_residuals: FloatArray) -> TileSeams | None:
-    """Find image tiles that a stereo matcher processed separately and shifted against each other.
+    """Find image tiles that a stereo matcher processed separately and shifted against each other, like a checkerboard.
 
-    The test compares the disparities of neighbouring points on both sides of possible seams.
+    The test compares the disparities of neighbouring points on both sides of possible seams. Tiles with unequal shifts agree with
+    some checkerboard by chance, which explains a small share of the jumps at their seams (`verdict.least_closed`).
 
     Parameters
     ----------
@@ -126,7 +132,8 @@ def find_tile_seams(residuals: StereoResiduals, registered_residuals: FloatArray
 
     Returns
     -------
-    TileSeams or None : the tiles; None if none are significant, or if the points lie on no pixel raster.
+    TileSeams or None : the tiles; None if none are significant, if their shifts are unequal, or if the points lie on no pixel
+        raster.
     """
     test = _SeamTest.of(residuals, registered_residuals)
     if test is None:
@@ -141,14 +148,74 @@ def find_tile_seams(residuals: StereoResiduals, registered_residuals: FloatArray
     found = test.trials(coarse.sides[coarse.best] * np.linspace(1 - reach, 1 + reach, _REFINED))
     sigmas, information = float(found.sigmas[found.best]), float(found.information[found.best])
     near = found.sides[np.abs(found.sigmas) > abs(sigmas) - 1]
+    amplitude, unequal = float(found.total[found.best]) / information, find_unequal_tiles(residuals, registered_residuals)
+    if unequal is not None and (2 * amplitude) ** 2 < thresholds().verdict.least_closed * unequal.jump_px**2:
+        return None
     return TileSeams(
         float(near.mean()),
-        float(found.total[found.best]) / information,
+        amplitude,
         float(np.ptp(near) + np.diff(found.sides)[0]) / np.sqrt(12),
         float(1 / np.sqrt(information)),
         0.5 * sigmas**2,
         p_value,
     )
+
+
+@dataclass(frozen=True)
+class UnequalTiles:
+    """Square image tiles whose disparities jump at their seams by amounts that follow no pattern.
+
+    The catalogue has no effect for them: a matcher that processes tiles separately may shift each by another amount.
+
+    Attributes
+    ----------
+    tile_px : side of a tile, px.
+    jump_px : standard deviation of the jumps, px.
+    p_value : p-value of the jumps, times the number of sides that were tried (Bonferroni).
+    """
+
+    tile_px: float
+    jump_px: float
+    p_value: float
+
+    @property
+    def note(self) -> str:
+        """Description of the tiles as a sentence for the report."""
+        return (
+            f"the disparities jump by {self.jump_px:.2g} px (standard deviation) every {self.tile_px:.3g} px along rows and "
+            f"columns (p = {self.p_value:.2g}), as if a matcher shifted each tile of the image by another amount"
+        )
+
+
+def find_unequal_tiles(residuals: StereoResiduals, value: FloatArray) -> UnequalTiles | None:
+    """Find image tiles that a stereo matcher shifted by unequal amounts, against each other.
+
+    Between each two neighbouring columns of the raster, the jump of each row of tiles is estimated by the mean difference, and
+    the squares are averaged. If tiles are shifted, the columns at their seams rank high among all columns, and so do rows. The
+    normal scores of the ranks (van der Waerden) are summed over the seams. A single edge on the wall therefore counts little.
+
+    Parameters
+    ----------
+    residuals : disparity residuals of n points with their pixels, px.
+    value : (n,) residuals after the systematic effects are removed, px.
+
+    Returns
+    -------
+    UnequalTiles or None : the tiles; None if none are significant (`locking.significance`), or if the points lie on no raster.
+    """
+    test = _SeamTest.of(residuals, value)
+    if test is None:
+        return None
+    axes = (
+        _AxisJumps.of(test.u, test.v, test.across.value, test.across.known),
+        _AxisJumps.of(test.v, test.u, test.down.value.T, test.down.known.T),
+    )
+    sides = test.sides[::_EVERY]
+    scores = np.array([_seam_score(axes, side) for side in sides])
+    side, p_value = float(sides[np.argmax(scores)]), float(len(scores) * norm.sf(scores.max()))
+    if p_value > thresholds().locking.significance:
+        return None
+    return UnequalTiles(side, float(np.sqrt(np.mean([each.jump_variance(side) for each in axes]))), p_value)
 
 
 def detectable_tile_shift(residuals: StereoResiduals, registered_residuals: FloatArray) -> DetectableSize:
@@ -213,6 +280,65 @@ class _TileTrials:
     def best(self) -> int:
         """Number of the side with the most significant amplitude."""
         return int(np.argmax(np.abs(self.sigmas)))
+
+
+@dataclass(frozen=True)
+class _AxisJumps:
+    """Sums of the differences of neighbouring cells along one axis of the raster, for the jumps between whole tiles.
+
+    along: (c,) coordinates of the cells along the axis, px; beside: (r,) those across it; sums, counts: (r + 1, c - 1) sums of
+    the differences over the cells across the axis before each, and the numbers of those that are known.
+    """
+
+    along: FloatArray
+    beside: FloatArray
+    sums: FloatArray
+    counts: FloatArray
+
+    @classmethod
+    def of(cls, along: FloatArray, beside: FloatArray, value: FloatArray, known: BoolArray) -> _AxisJumps:
+        """Sum the differences (r, c - 1), which are 0 where one is not known."""
+        sums, counts = (np.pad(np.cumsum(each, axis=0, dtype=np.float64), ((1, 0), (0, 0))) for each in (value, known))
+        return cls(along, beside, sums, counts)
+
+    def jumps(self, side: float) -> tuple[FloatArray, FloatArray, NDArray[np.int64]]:
+        """Sums of the differences over each row of tiles (t, c - 1), their numbers, and the numbers of the seams.
+
+        side: side of a tile, px.
+        """
+        edges = np.flatnonzero(np.diff(np.floor(self.beside / side))) + 1
+        rows = np.concatenate([[0], edges, [len(self.beside)]])
+        return (
+            np.diff(self.sums[rows], axis=0),
+            np.diff(self.counts[rows], axis=0),
+            np.flatnonzero(np.diff(np.floor(self.along / side))),
+        )
+
+    def seam_scores(self, side: float) -> FloatArray:
+        """Normal scores of the mean squared jumps at the seams, among those between all neighbouring columns."""
+        sums, counts, seams = self.jumps(side)
+        square = np.divide(sums**2, counts, out=np.zeros_like(sums), where=counts > 0).sum(axis=0)
+        rows = (counts > 0).sum(axis=0)
+        known = rows > 0
+        rank = np.zeros(len(rows))
+        rank[known] = rankdata(square[known] / rows[known])
+        return ndtri((rank[seams][known[seams]] - 0.5) / known.sum())
+
+    def jump_variance(self, side: float) -> float:
+        """Variance of the jumps at the seams beyond that elsewhere, px²."""
+        sums, counts, seams = self.jumps(side)
+        at_seam = np.zeros(sums.shape[1], dtype=bool)
+        at_seam[seams] = True
+        known, many = counts > 0, np.maximum(counts, 1)
+        noise = float(np.mean((sums**2 / many)[known & ~at_seam]))
+        jump = ((sums**2 / many - noise) / many)[known & at_seam]
+        return max(float(jump.mean()), 0.0)
+
+
+def _seam_score(axes: tuple[_AxisJumps, _AxisJumps], side: float) -> float:
+    """Sum of the normal scores of all seams, standardised; 0 if there are too few seams."""
+    scores = np.concatenate([each.seam_scores(side) for each in axes])
+    return float(scores.sum() / np.sqrt(len(scores))) if len(scores) >= _FEWEST_SEAMS else 0.0
 
 
 def _axis(x: FloatArray, step: float) -> tuple[FloatArray, NDArray[np.int64]]:
