@@ -7,8 +7,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
+from monitor_cases import UTM, las, points
 
+from pipeline.change.areas import check_some_inside
 from pipeline.cli.main import main
+from pipeline.formats.measurements.config import MeasurementConfig
+from pipeline.monitoring.options import MonitorOptions, read_areas
+from pipeline.monitoring.reading import find_epochs
+from pipeline.monitoring.run import monitor
+from pipeline.monitoring.site import prepared
 from scene.blocks.block import RockfallConfig
 from scene.common.config import load_yaml, parse
 from scene.common.errors import InputError
@@ -128,4 +135,94 @@ def test_an_error_of_syntax_names_the_file_and_the_place(text: str, place: str, 
 
 @pytest.mark.parametrize("words", [["simulate", "--sensor", "tls"], ["inspect", "glendale"]])
 def test_a_folder_that_cannot_be_made_is_named_as_option(words: list[str], capsys: pytest.CaptureFixture[str]) -> None:
-    assert "error: --out /proc/foo: the folder cannot be created in /proc" in said(capsys, *words, "--out", "/proc/foo")
+    assert "error: --out /proc/foo: the path cannot be used as a folder: no folder can be created in /proc" in said(
+        capsys, *words, "--out", "/proc/foo"
+    )
+
+
+@pytest.mark.parametrize(
+    ("words", "problem"),
+    [
+        (["calibrate", "empty", "--out", "out"], "empty: the folder contains no measured epochs"),
+        (["train", "empty", "--out", "out"], "empty: the folder is no data set to train on (train/annotations.json is missing)"),
+        (["train", "nothere", "--out", "out"], "nothere: there is no such folder"),
+        (["train", "split", "--out", "out"], "this is one part of a data set"),
+        (["export", "empty", "picture"], "empty: the folder contains no run (run.json is missing)"),
+        (["export", "nothere", "picture"], "nothere: there is no such folder"),
+        (["export", "nothere", "yolo"], "nothere: there is no such folder"),
+        (["gap", "--identifiability", "scan.laz", "--out", "out"], "scan.laz: the file is neither a config nor a measurement"),
+        (["measurement", "scan.laz", "--reference", "link.laz", "--scanner", "riegl_vz400i", "--out", "out"], "the scan itself"),
+        (["measurement", "scan.laz", "--reference", "scan.laz", "--photographs", "--out", "out"], "the scan itself"),
+        (["gap", "scan.laz", "--reference", "scan.laz", "--scanner", "riegl_vz400i", "--out", "out"], "the scan itself"),
+    ],
+)
+def test_folders_and_files_of_another_kind_are_called_so(
+    words: list[str], problem: str, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("empty").mkdir()
+    Path("split").mkdir()
+    Path("split/annotations.json").write_text("{}")
+    Path("scan.laz").write_bytes(b"LASF")
+    Path("link.laz").symlink_to("scan.laz")
+    assert problem in said(capsys, *words)
+    assert not Path("out").exists()
+
+
+def test_a_measurement_is_not_its_own_reference() -> None:
+    values = {"sensor": "stereo", "reference": "a.ply", "points": ["b.ply", "a.ply"], "model": "model.yaml"}
+    with pytest.raises(InputError, match="'reference' and 'points' name the same file"):
+        parse(MeasurementConfig, values, "measurement.yaml")
+
+
+@pytest.mark.parametrize("area", [[10, 5, 2, 8], [2, 8, 10, 5], [2, 5, 2, 8]])
+def test_a_box_of_stable_rock_needs_its_lower_corner_first(area: list[float], tmp_path: Path) -> None:
+    (tmp_path / "stable.yaml").write_text(f"[{area}]\n")
+    with pytest.raises(InputError, match="x0 must be below x1 and y0 below y1"):
+        read_areas(tmp_path / "stable.yaml")
+
+
+def test_areas_outside_the_wall_are_refused_with_the_extent_of_the_wall() -> None:
+    x, y = np.array([0.0, 16.0]), np.array([0.0, 10.0])
+    with pytest.raises(InputError, match=r"--stable: all areas lie outside .* x 0\.0 to 16\.0 m and y 0\.0 to 10\.0 m"):
+        check_some_inside(np.array([False, False]), x, y, "--stable")
+    check_some_inside(np.array([False, True]), x, y, "--stable")
+
+
+@pytest.fixture
+def epochs(tmp_path: Path) -> list[str]:
+    """Return the files of two epochs of one wall."""
+    return [str(las(tmp_path / f"{name}.las", points(20_000, seed))) for seed, name in enumerate("ab")]
+
+
+@pytest.mark.parametrize(
+    ("area", "kept"), [("[100, 100, 120, 120]", False), ("[0, 0, 0, 1, 1, 1]", False), ("[1, 1, 12, 8]", True)]
+)
+def test_monitor_checks_stable_areas_on_the_reference(area: str, *, kept: bool, epochs: list[str], tmp_path: Path) -> None:
+    (tmp_path / "stable.yaml").write_text(f"[{area}]\n")
+    options = MonitorOptions(position=UTM + np.array([8.0, -50.0, 5.0]), stable=read_areas(tmp_path / "stable.yaml"))
+    sources = find_epochs([Path(each) for each in epochs], ())
+    if kept:
+        assert prepared(sources[0], options).grid.width > 0
+    else:
+        with pytest.raises(InputError, match="--stable: all areas lie outside the measured wall"):
+            monitor(sources, tmp_path / "out", options)
+        assert not (tmp_path / "out").exists()
+
+
+def test_monitor_has_nothing_to_resume_in_a_folder_without_results(
+    epochs: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    message = said(capsys, "monitor", *epochs, "--out", tmp_path / "out", "--resume")
+    assert "there is no monitoring to resume" in message
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize("follows", [False, True])
+def test_monitor_refuses_a_detector_that_is_none_before_any_work(
+    epochs: list[str], *, follows: bool, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    further = ["--follow", str(tmp_path)] if follows else epochs[1:]
+    message = said(capsys, "monitor", epochs[0], *further, "--out", tmp_path / "out", "--detector", "nosuch")
+    assert "error: --detector nosuch: the folder holds no detector" in message
+    assert not (tmp_path / "out").exists()

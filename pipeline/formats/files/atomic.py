@@ -184,7 +184,7 @@ def check_place(out: Path) -> None:
         reason = getattr(error, "strerror", None) or "a null character in its name"
         problem = "the path cannot be used as a folder"
         if made and "\0" not in str(out):
-            problem = f"the folder cannot be created in {_existing(out)}"
+            problem += f": no folder can be created in {_existing(out)}"
         raise InputError(f"{problem} ({reason})", where=f"--out {out}", remedy=_ELSEWHERE) from None
     finally:
         _remove_empty(made)
