@@ -335,7 +335,9 @@ def verdicts() -> dict[str, Verdict]:
             "the effects at your site. You can use model_after.yaml for surveys of this wall from this place, whichever effect "
             "is true. Elsewhere it may be wrong.",
             "All ranges of a scanner are too long by 2 mm. On this wall most of that looks like a shift of the scanner, which is "
-            "fitted first. What is left of it resembles what is left of two other effects, which the report names.",
+            "fitted first. What is left of it resembles what is left of two other effects, which the report names. Which ones "
+            "these are depends on the wall, the distance and the noise. [From symptom to cause](symptoms.md) compares patterns "
+            "without noise on another wall, so it lists another effect.",
             _case(seed=13, ranges=lambda scan: scan.R + 0.002),
             "The report proposes two measurements, and one of them suffices: targets around the station, whose positions are "
             "known to 1 mm, or a second station.\n\n"

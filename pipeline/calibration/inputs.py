@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from pipeline.calibration.reference_error import ReferenceError
 from pipeline.calibration.windows import Windows, choose_windows, stable_ground
+from pipeline.change.areas import Area, check_some_inside
 from pipeline.config.simulation import SensorName, SimulationConfig
 from pipeline.formats.measurements.measurement import (
     FILE,
@@ -22,7 +23,7 @@ from pipeline.formats.measurements.measurement import (
 )
 from pipeline.formats.rasters.geotiff import read_geotiff
 from pipeline.formats.records.result_records import RUN_FILE, read_run
-from pipeline.noise.measured import MeasuredMaps, area_mask, read_measured
+from pipeline.noise.measured import MeasuredMaps, area_mask, map_files, read_measured
 from pipeline.run.site import SensorSite, prepare_site
 from scene.common.errors import InputError
 from scene.common.keyed_random import KeyedRandom
@@ -114,6 +115,8 @@ def sensor_of(paths: Sequence[Path], config: SimulationConfig, wanted: SensorNam
             return _matching_sensor(read_measurement(path).sensor, wanted, path)
         if (path / RUN_FILE).is_file():
             return _matching_sensor(read_run(path / RUN_FILE, "run it again with simulate")["sensor"], wanted, path)
+        if path.is_dir():
+            map_files(path)
     if wanted is not None:
         return wanted
     names = config.sensor_names()
@@ -150,16 +153,29 @@ def read_inputs(paths: Sequence[Path], config: SimulationConfig, sensor: SensorN
     """
     measured, names = _maps(paths, config, random)
     _check_noise(measured.maps, names)
+    drawn = _drawn_areas(config.calibration.stable_areas, measured)
     of_points = bool(measured.points)
     measurement = read_measurement(paths[0]) if of_points else None
     if measurement is not None:
         site, error = _measured_site(measurement, config), ReferenceError.of(measurement)
     else:
         site, error = prepare_site(config, sensor, random), None
-    areas = config.calibration.stable_areas
-    drawn = area_mask(areas, measured.grid) if areas else measured.stable
     stable = _covered(measured.maps, of_points) & (stable_ground(list(measured.maps)) if drawn is None else drawn)
     return CalibrationInputs(names, measured.grid, measured.maps, stable, drawn is not None, site, of_points, error, measurement)
+
+
+def _drawn_areas(areas: Sequence[Area], measured: MeasuredMaps) -> BoolArray | None:
+    """Return the pixels (h, w) in the config's stable areas, or else in the measurement's; None if nobody drew any.
+
+    Raises InputError if the config's lie outside the maps.
+    """
+    if not areas:
+        return measured.stable
+    drawn, grid = area_mask(areas, measured.grid), measured.grid
+    x = np.array([grid.x_min, grid.x_min + grid.width * grid.gsd])
+    y = np.array([grid.y_max - grid.height * grid.gsd, grid.y_max])
+    check_some_inside(drawn, x, y, "calibration.stable_areas")
+    return drawn
 
 
 def _maps(paths: Sequence[Path], config: SimulationConfig, random: KeyedRandom) -> tuple[MeasuredMaps, tuple[str, ...]]:

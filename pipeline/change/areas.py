@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import BeforeValidator, Field
 
+from scene.common.errors import InputError
 from scene.geometry.mesh import FloatArray
 
 Box = tuple[float, float, float, float]
@@ -23,6 +24,8 @@ def _check_shape(area: Any) -> Any:
         shape = ()
     if shape != (4,) and not (len(shape) == 2 and shape[0] >= 3 and shape[1] == 2):
         raise ValueError("is neither a box [x0, y0, x1, y1] nor a polygon [[x, y], [x, y], [x, y], ...]")
+    if shape == (4,) and not (area[0] < area[2] and area[1] < area[3]):
+        raise ValueError("is a box [x0, y0, x1, y1] without extent: x0 must be below x1 and y0 below y1; exchange the corners")
     return area
 
 
@@ -44,6 +47,28 @@ def in_areas(areas: Iterable[Area], x: FloatArray, y: FloatArray) -> NDArray[np.
         else:
             found |= _in_polygon(corners, x, y)
     return found
+
+
+def check_some_inside(inside: NDArray[np.bool_], x: FloatArray, y: FloatArray, where: str) -> None:
+    """Raise InputError if none of the user's areas contains any place of the wall.
+
+    Parameters
+    ----------
+    inside : (n,) bool array
+        Whether each place lies in an area.
+    x, y : (n,) arrays
+        Coordinates of the places, wall frame, m.
+    where : str
+        Option or file and key of the areas, for the error.
+    """
+    if inside.any() or not len(x):
+        return
+    raise InputError(
+        "all areas lie outside the measured wall",
+        where=where,
+        allowed=f"areas that overlap x {x.min():.1f} to {x.max():.1f} m and y {y.min():.1f} to {y.max():.1f} m of the wall frame",
+        remedy="correct the coordinates of the areas: x runs along the wall and y up the wall, from the corner of the maps",
+    )
 
 
 def _in_polygon(corners: FloatArray, x: FloatArray, y: FloatArray) -> Any:

@@ -188,6 +188,13 @@ def _identifiability(arguments: argparse.Namespace, out: Path) -> CommandOutput:
             remedy="give one measurement or config",
         )
     given = arguments.measurement[0]
+    if given.is_file() and given.suffix.lower() not in (".yaml", ".yml", ".json"):
+        raise InputError(
+            "the file is neither a config nor a measurement",
+            where=f"--identifiability {given}",
+            allowed="a folder with measurement.yaml, a folder of monitor, or a config (.yaml, .json)",
+            remedy="build the folder first with scarpsim measurement SCAN --reference FILE --scanner PRESET --out FOLDER",
+        )
     if _of_monitor([given]):
         given = _folder_of_monitoring(arguments, given, out / "measurement")
     wanted = load_surveys(given, arguments.overrides, arguments.sensor)

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import argparse
 import os
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 
 from pipeline.cli.command_output import CommandOutput
@@ -46,6 +47,7 @@ def run(arguments: argparse.Namespace) -> CommandOutput:
     kind = "dataset" if arguments.dataset else "simulation"
     meshes = [_relative_to_config(out, path) for path in arguments.mesh or ()]
     cameras = _relative_to_config(out, arguments.cameras) if arguments.cameras else ""
+    _check_inputs(arguments)
     made = _data_set_text(arguments.dataset) if arguments.dataset else ""
     text = made or simulation_text(arguments.site, arguments.scanner, meshes, cameras)
     from pipeline.cli.json_schema import schema_line, schema_name, schema_text
@@ -72,6 +74,40 @@ def _relative_to_config(out: Path, path: Path) -> str:
     if not path.exists():
         raise InputError("there is no such file", where=str(path), remedy="give the path of an existing file")
     return os.path.relpath(path.resolve(), out.parent.resolve())
+
+
+def _check_inputs(arguments: argparse.Namespace) -> None:
+    """Raise InputError if a mesh, the cameras, the site or the scanner cannot be used."""
+    if arguments.site:
+        with _named("--site"):
+            from pipeline.config.bundled import bundled_config
+
+            bundled_config("sites", arguments.site)
+    if arguments.scanner:
+        with _named("--scanner"):
+            from pipeline.config.presets import read_preset
+
+            read_preset(arguments.scanner)
+    for path in arguments.mesh or ():
+        with _named("--mesh"):
+            from scene.walls.imported import check_mesh_file
+
+            check_mesh_file(path)
+    if arguments.cameras:
+        with _named("--cameras"):
+            from pipeline.formats.cameras.camera_files import read_oriented
+            from pipeline.formats.cameras.cameras import read_cameras_yaml
+
+            _ = read_oriented(arguments.cameras) or read_cameras_yaml(arguments.cameras)
+
+
+@contextmanager
+def _named(option: str) -> Iterator[None]:
+    """Within the `with` block, put the name of an option before the place that an InputError names."""
+    try:
+        yield
+    except InputError as error:
+        raise InputError(error.what, where=f"{option}: {error.where}", allowed=error.allowed, remedy=error.remedy) from None
 
 
 def simulation_text(site: str | None, scanner: str | None, meshes: Sequence[str] = (), cameras: str = "") -> str:

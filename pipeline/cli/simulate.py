@@ -60,7 +60,8 @@ def run(arguments: argparse.Namespace) -> CommandOutput:
     arguments.kept = f"finished epochs are in {out} and usable; continue with --resume --out {out}"
     with shown_progress(quiet=arguments.quiet) as progress:
         summary = pipeline_run.simulate(config, arguments.sensor, out, resume=arguments.resume, progress=progress)
-    return CommandOutput(f"report: {summary.report}", record_document(summary.report, "run.json"))
+    told = [*(f"note: {note}" for note in summary.notes), f"report: {summary.report}"]
+    return CommandOutput("\n".join(told), record_document(summary.report, "run.json"))
 
 
 def _use_threads(count: int) -> None:

@@ -13,6 +13,8 @@ from scene.common.errors import InputError
 SUMMARY = "train a rockfall detector on a data set"
 EXAMPLE = """  scarpsim train my_dataset --out my_detector
   scarpsim train my_dataset --config configs/detectors/resnet50.yaml --set training.epochs=40 --out my_detector --resume"""
+_SPLITS = ("train", "val")
+"""Parts of a data set that training needs."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -57,7 +59,8 @@ def run(arguments: argparse.Namespace) -> CommandOutput:
     overrides = [*arguments.overrides, *([f"training.seed={arguments.seed}"] if arguments.seed is not None else [])]
     path = config_path("detectors", arguments.config) if arguments.config else bundled_config("detectors", "light")
     config = load_train_config(path, overrides)
-    for split in ("train", "val"):
+    _check_data_set(arguments.data_set)
+    for split in _SPLITS:
         CocoFolder(arguments.data_set / split).check_images()  # report mistakes before TensorFlow takes its time to load
     if config.training.start is not None:
         check_detector(detector_folder(config.training.start))
@@ -72,6 +75,24 @@ def run(arguments: argparse.Namespace) -> CommandOutput:
     told = f"{count} epoch{'s' if count > 1 else ''}, validation loss {history.total[-1]:.4f}, best {best:.4f}: {model}"
     document = {"folder": str(arguments.out), "model": str(model), "epochs": count}
     return CommandOutput(told, lambda: document | {"validation_loss": history.total[-1], "best_validation_loss": best})
+
+
+def _check_data_set(folder: Path) -> None:
+    """Raise InputError if a folder lacks one of the two parts of a data set."""
+    missing = [split for split in _SPLITS if not (folder / split / "annotations.json").is_file()]
+    if not missing:
+        return
+    if not folder.is_dir():
+        raise InputError("there is no such folder", where=str(folder), remedy="give the folder that scarpsim dataset made")
+    remedy = "give the folder that scarpsim dataset made"
+    if (folder / "annotations.json").is_file():
+        remedy = f"this is one part of a data set: give the folder around it, {folder.parent}"
+    raise InputError(
+        f"the folder is no data set to train on ({missing[0]}/annotations.json is missing)",
+        where=str(folder),
+        allowed=f"a folder with {' and '.join(_SPLITS)}",
+        remedy=remedy,
+    )
 
 
 def _check_training(out: Path) -> None:

@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from copy import deepcopy
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, TypeVar
 
 import yaml
 
 from scene.common.errors import InputError
 from scene.common.yaml_text import parse_yaml
+
+ConfigT = TypeVar("ConfigT")
 
 
 @dataclass(frozen=True)
@@ -50,6 +52,48 @@ def read_override(text: str) -> Override:
             where=where,
             remedy="correct the value, and put a text with special characters in quotes",
         ) from None
+
+
+def read_with_overrides(
+    read: Callable[[Sequence[str | Override]], ConfigT], overrides: Sequence[str | Override], file: str
+) -> ConfigT:
+    """Read a config with overrides, and name the `--set` options in the error if they caused it.
+
+    Parameters
+    ----------
+    read : callable
+        Reads the config with the overrides that it is given. Raises InputError.
+    overrides : sequence of str or Override
+        The changes. Those that are text were given as `--set`.
+    file : str
+        The config file, as errors of `read` name it.
+
+    Returns
+    -------
+    The config that `read` returns.
+
+    Raises
+    ------
+    InputError
+        As `read`. If the file is valid without the overrides, the message names the options that make it invalid.
+    """
+
+    def is_wrong(changes: Sequence[str | Override]) -> bool:
+        try:
+            read(changes)
+        except InputError:
+            return True
+        return False
+
+    try:
+        return read(overrides)
+    except InputError as error:
+        given = [each for each in overrides if isinstance(each, str)]
+        if not given or error.where.startswith("--set ") or is_wrong([each for each in overrides if not isinstance(each, str)]):
+            raise
+        options = ", ".join(f"--set {each}" for each in [each for each in given if is_wrong([each])] or given)
+        where = error.where.replace(file, options) if file in error.where else f"{options}: {error.where}"
+        raise InputError(error.what, where=where, allowed=error.allowed, remedy=error.remedy) from None
 
 
 def apply_overrides(values: dict[str, Any], overrides: Sequence[str | Override]) -> dict[str, Any]:

@@ -15,11 +15,12 @@ from pipeline.change.m3c2 import M3c2Config
 from pipeline.change.tiles import TileConfig
 from pipeline.config.bundled import bundled_config
 from pipeline.config.calibration import CalibrationConfig
-from pipeline.config.overrides import Override, apply_overrides
+from pipeline.config.overrides import Override, apply_overrides, read_with_overrides
 from pipeline.config.presets import expand_shorthand, is_path, model_file, with_preset, without_keys_of_preset
 from pipeline.config.series import SeriesConfig
 from pipeline.formats.cameras.camera_files import oriented_files, read_oriented, stereo_pair
 from pipeline.formats.cameras.cameras import PairConfig, cameras_yaml_files, read_cameras_yaml
+from pipeline.formats.measurements.model_file import sensor_model
 from pipeline.precision.detectability import PlanningConfig
 from pipeline.registration.register import IcpConfig
 from pipeline.surface.mesh import SurfaceConfig
@@ -222,6 +223,24 @@ class SimulationConfig(Config):
                 raise ValueError("a sensor model needs `sensor: stereo` or `sensor: tls`")
         return models
 
+    @field_validator("wall", mode="before")
+    @classmethod
+    def _of_one_kind(cls, value: Any) -> Any:
+        """Refuse a path as the `wall` section, and a mesh beside the keys of a generated wall."""
+        if isinstance(value, str):
+            raise ValueError("a wall is a section of keys; for a mesh file write wall: {mesh: FILE}, or --set wall={mesh: FILE}")
+        generated = (
+            sorted(set(value) & (set(ProceduralWall.model_fields) - set(ImportedWall.model_fields)))
+            if (isinstance(value, dict) and "mesh" in value)
+            else []
+        )
+        if generated:
+            raise ValueError(
+                f"a wall is either a mesh or generated: `mesh` cannot be combined with {', '.join(generated)}; leave "
+                "them out, or replace the section with --set wall={mesh: FILE}"
+            )
+        return value
+
     @field_validator("cameras", mode="before")
     @classmethod
     def _from_path(cls, value: Any) -> Any:
@@ -337,6 +356,13 @@ def resolved(
     InputError
         If anything is wrong, or if the config only has models of another sensor than `sensor`.
     """
+    return read_with_overrides(lambda changes: _resolved(values, changes, sensor, seed, path), overrides, str(path))
+
+
+def _resolved(
+    values: Any, overrides: Sequence[str | Override], sensor: SensorName | None, seed: int | None, path: Path
+) -> SimulationConfig:
+    """Make and check a config; see `resolved`."""
     own: dict[str, Any] = {}
     values = {} if values is None else values
     if not isinstance(values, dict):
@@ -351,7 +377,7 @@ def resolved(
     values = without_keys_of_preset(_with_paths(values, path.parent), later) | own
     values = _with_paths(apply_overrides(values, later), Path.cwd())
     if isinstance(values.get("sensor"), str):
-        values["sensor"] = load_yaml(model_file(values["sensor"]))
+        values["sensor"] = _checked_models(model_file(values["sensor"]))
     if seed is not None:
         values["seed"] = seed
     config = parse(SimulationConfig, values, str(path))
@@ -362,6 +388,14 @@ def resolved(
             remedy=f"add a model with `sensor: {sensor}`, or give the other sensor with --sensor",
         )
     return config
+
+
+def _checked_models(path: Path) -> Any:
+    """Read a file of a sensor model or a list of models, and check each, so that an error names this file."""
+    found = load_yaml(path)
+    for model in found if isinstance(found, list) else [found]:
+        sensor_model(model, str(path))
+    return found
 
 
 def _with_first_surface(values: dict[str, Any]) -> dict[str, Any]:

@@ -11,7 +11,7 @@ from pydantic import Field, StringConstraints, ValidationError, field_validator,
 from pipeline.change.annotate import AnnotationConfig
 from pipeline.change.tiles import TileConfig
 from pipeline.config.bundled import bundled_config
-from pipeline.config.overrides import Override, apply_overrides
+from pipeline.config.overrides import Override, apply_overrides, read_with_overrides
 from pipeline.config.presets import is_path, model_file
 from pipeline.config.simulation import SensorModel, SensorName, SimulationConfig, load_config
 from scene.blocks.block import RockfallConfig
@@ -244,6 +244,11 @@ def dataset_config(values: Any, overrides: Sequence[str | Override], seed: int |
     InputError
         If anything in the config is wrong.
     """
+    return read_with_overrides(lambda changes: _dataset_config(values, changes, seed, path), overrides, str(path))
+
+
+def _dataset_config(values: Any, overrides: Sequence[str | Override], seed: int | None, path: Path) -> DatasetConfig:
+    """Make and check a data set's config; see `dataset_config`."""
     if not isinstance(values, dict):
         raise InputError("the file is not a mapping of keys", where=str(path), remedy="start from configs/datasets/small.yaml")
     if "sources" in values and "fingerprint" in values:

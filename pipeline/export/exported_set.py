@@ -14,7 +14,7 @@ def splits_of(folder: Path) -> dict[str, Tiles]:
     splits = [split for split in SPLITS if (folder / split / "annotations.json").is_file()]
     if not splits:
         raise InputError(
-            "the folder contains no split of a data set",
+            "the folder contains no split of a data set" if folder.is_dir() else "there is no such folder",
             where=str(folder),
             allowed=f"a folder with {', '.join(SPLITS)}",
             remedy="give the folder that scarpsim dataset made",

@@ -83,6 +83,7 @@ def build(request: Request, out: Path) -> Interpretation:
     InputError
         If a file cannot be used, the scanner's place is unknown, or points and reference do not overlap.
     """
+    request.check_reference()
     model, model_words = read_scanner_model(request)
     scans = _scans(request)
     stations = _stations(scans, request)
@@ -170,6 +171,7 @@ def build_stereo(request: Request, cameras: Path, labels: tuple[str, str] | None
             where="--reference half",
             remedy="name a mesh, a cloud or a DEM",
         )
+    request.check_reference()
     pair = read_pair(cameras, labels)
     model = StereoModel() if request.model is None else read_model(request.model)
     if not isinstance(model, StereoModel):

@@ -6,6 +6,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from scene.common.errors import InputError
+
 
 @dataclass(frozen=True)
 class Request:
@@ -33,3 +35,15 @@ class Request:
     reference_unit: str | None = None
     columns: Sequence[str] = ()
     number: int | None = None
+
+    def check_reference(self) -> None:
+        """Raise InputError if the reference is the file of a scan, because nothing differs from itself."""
+        reference = Path(self.reference)
+        for scan in self.scans:
+            if scan.exists() and reference.exists() and scan.samefile(reference):
+                raise InputError(
+                    "the reference is the scan itself, so that they cannot differ",
+                    where=f"--reference {self.reference}",
+                    allowed="a mesh, a DEM, the scan of another epoch, or the word half for laser scans",
+                    remedy="give another file as the reference",
+                )

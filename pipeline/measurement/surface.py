@@ -50,6 +50,7 @@ def build_surface(request: Request, out: Path) -> Interpretation:
         If a file cannot be used, cloud and reference do not overlap, or the noise cannot be estimated.
     """
     _check(request)
+    request.check_reference()
     clouds = [_read(path, request) for path in request.scans]
     points = clouds[0].cloud.points
     reference, side = _reference(request, points)

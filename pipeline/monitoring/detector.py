@@ -11,13 +11,30 @@ from pathlib import Path
 import numpy as np
 from pycocotools import mask as coco_mask
 
+from pipeline.detection.inference.weights import check_detector
+from pipeline.detection.products.run import BASELINE, detector_folder
 from pipeline.monitoring.events import Change, ChangedRegion, region_of_mask
+from pipeline.monitoring.options import NO_DETECTOR
 from scene.common.errors import InputError, OutsideError
 
 CONFIDENCE = 0.9
 """Lowest score that counts."""
 _COMMAND = "import sys; from pipeline.cli.main import main; sys.exit(main(sys.argv[1:]))"
 _WRONG_INPUT = 2
+
+
+def check_detector_name(detector: str) -> None:
+    """Raise InputError, naming the option --detector, if a detector cannot be used, as far as can be checked in a second.
+
+    detector: name or folder, as for `scarpsim detect`, or "none".
+    """
+    if detector in (NO_DETECTOR, BASELINE):
+        return
+    try:
+        check_detector(detector_folder(detector))
+    except InputError as error:
+        remedy = f"choose one of: default, {BASELINE}, {NO_DETECTOR}, or a folder made by `scarpsim train`"
+        raise InputError(error.what, where=f"--detector {detector}", allowed=error.allowed, remedy=remedy) from None
 
 
 def regions_of_detector(detector: str, difference: Path, change: Change) -> list[ChangedRegion]:

@@ -8,9 +8,12 @@ from pathlib import Path
 from typing import Any
 
 from pipeline.formats.files.atomic import empty_folder
+from pipeline.monitoring.detector import check_detector_name
+from pipeline.monitoring.model import scanner_model
 from pipeline.monitoring.options import MonitorOptions
 from pipeline.monitoring.products import Result
 from pipeline.monitoring.reading import epoch_files
+from pipeline.monitoring.records import can_be_resumed
 from pipeline.monitoring.run import monitor_paths
 from pipeline.report.progress import Progress
 from pipeline.report.words import counted
@@ -51,7 +54,7 @@ def follow(
         Number of processes; the results do not depend on it.
     resume : bool
         Must be True to continue an earlier call that stopped before its results were complete. Complete results are continued
-        in any case.
+        in any case, and an empty folder is filled in any case.
     every_s : float
         Time between two looks at the folder, s.
     ended : callable
@@ -81,7 +84,9 @@ def follow(
             remedy="leave --times out",
         )
     keys: dict[str, Any] = {"workers": workers, "progress": Progress()}
-    resume = resume or (out / "monitor.json").exists()
+    scanner_model(options)  # a wrong preset, file or detector is reported before waiting
+    check_detector_name(options.detector)
+    resume = (resume and can_be_resumed(out)) or (out / "monitor.json").exists()
     if not resume:
         empty_folder(out)
     result = monitor_paths(paths, out, options, resume=resume, **keys) if len(paths) > 1 else None

@@ -99,7 +99,7 @@ def read_areas(path: Path) -> tuple[StableArea, ...]:
     try:
         found = TypeAdapter(tuple[StableArea, ...]).validate_python(areas)
     except ValidationError as error:
-        wrong = error.errors()[0]["msg"]
+        wrong = error.errors()[0]["msg"].removeprefix("Value error, ")
         raise InputError(
             f"the file is not a list of areas ({wrong})",
             where=str(path),

@@ -22,6 +22,11 @@ CAUTION = "caution: "
 """Beginning of the remarks on an epoch without which its result would mislead."""
 
 
+def can_be_resumed(out: Path) -> bool:
+    """Return whether a folder has anything that `monitor` wrote, even if it was killed before the first epoch was finished."""
+    return (out / KEPT).exists() or (out / "monitor.json").exists() or any(out.glob("*difference_*.tif"))
+
+
 @dataclass(frozen=True)
 class EpochRecord:
     """The result of comparing one epoch with the reference, as it is stored so that an interrupted `monitor` can go on.

@@ -22,7 +22,7 @@ from pipeline.formats.files.atomic import empty_folder, write_bytes
 from pipeline.formats.files.checksum import sha256
 from pipeline.formats.rasters.geotiff import write_geotiff
 from pipeline.monitoring.comparison import EpochChange, compare_epoch
-from pipeline.monitoring.detector import regions_of_detector
+from pipeline.monitoring.detector import check_detector_name, regions_of_detector
 from pipeline.monitoring.events import Catalogue
 from pipeline.monitoring.model import predicted_level, scanner_model
 from pipeline.monitoring.options import NO_DETECTOR, MonitorOptions
@@ -30,7 +30,7 @@ from pipeline.monitoring.plausibility import check_motion, compared_area, remark
 from pipeline.monitoring.point_writing import PointsInOrder, write_points_once
 from pipeline.monitoring.products import Followed, Result, write_results
 from pipeline.monitoring.reading import EpochData, EpochSource, find_epochs, read_epoch
-from pipeline.monitoring.records import KEPT, EpochRecord, discard, kept
+from pipeline.monitoring.records import KEPT, EpochRecord, can_be_resumed, discard, kept
 from pipeline.monitoring.site import ReferenceSite, prepared
 from pipeline.monitoring.stable_areas import StableRock
 from pipeline.monitoring.targets import TargetFit, fit_targets, read_targets
@@ -123,8 +123,17 @@ def monitor(
         If a file cannot be used, or if an epoch does not overlap the reference.
     """
     progress = progress or Progress()
+    scanner_model(options)  # a wrong preset, file or detector is reported before any work
+    check_detector_name(options.detector)
     if not resume:
         empty_folder(out)
+    elif not can_be_resumed(out):
+        raise InputError(
+            "there is no monitoring to resume in the folder",
+            where=f"--resume, --out {out}",
+            allowed="the folder of an interrupted monitoring",
+            remedy="start without --resume, or correct --out",
+        )
     count = min(workers, len(sources) - 1)
     with ExitStack() as stack:
         # An earlier call may have left nothing to do, so workers of a resumed one are started where they are needed.
@@ -143,7 +152,6 @@ def _monitored(
     started: BackgroundWorkers | None,
 ) -> Result:
     """Do the work of `monitor`, on workers that were started before if there are any."""
-    scanner_model(options)  # a wrong preset or file is reported before any work
     with progress.stage(f"reference {sources[0].name}"):
         site = prepared(sources[0], options)
     fingerprint = _fingerprint(site, options)

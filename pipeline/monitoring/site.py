@@ -7,12 +7,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from pipeline.change.areas import check_some_inside
 from pipeline.monitoring.alignment import SAME
 from pipeline.monitoring.comparison import ReferenceHeights
 from pipeline.monitoring.frame import raster_of, towards_sensor, wall_frame
 from pipeline.monitoring.gridding import HeightRaster
 from pipeline.monitoring.options import MonitorOptions
 from pipeline.monitoring.reading import EpochData, EpochSource, read_epoch
+from pipeline.monitoring.stable_areas import StableArea, StableRock
 from pipeline.monitoring.views import MOST_VIEWS, Partition, divided
 from pipeline.registration.rigid import RigidTransform
 from scene.common.errors import InputError
@@ -112,11 +114,25 @@ def prepared(source: EpochSource, options: MonitorOptions) -> ReferenceSite:
     grids = _grids(data, frames, partition, options)
     points = data.wall_points(wall, grids[0].gsd, several=partition is not None)
     reference = ReferenceHeights.of(points, grids, [_between(wall, frame) for frame in frames], partition)
+    _check_stable_areas(options.stable, frames, reference.rasters)
     parts = zip(frames, reference.rasters, strict=True)
     views = tuple(WallView(number, *each) for number, each in enumerate(parts, start=1))
     notes = [*data.notes, f"the wall was seen from its side of ({', '.join(f'{value:.2f}' for value in towards)}), {how}"]
     notes += _notes(views)
     return ReferenceSite(source, views, wall.to_wall(towards), reference, data.count, data.crs, tuple(notes))
+
+
+def _check_stable_areas(areas: Sequence[StableArea], frames: Sequence[WallFrame], rasters: Sequence[HeightRaster]) -> None:
+    """Raise InputError if the user gave stable areas that all lie outside the wall. frames, rasters: of each view."""
+    if not areas:
+        return
+    places = []
+    for frame, raster in zip(frames, rasters, strict=True):
+        row, column = np.nonzero(raster.known)
+        x, y = raster.grid.x_min + (column + 0.5) * raster.grid.gsd, raster.grid.y_max - (row + 0.5) * raster.grid.gsd
+        places.append(frames[0].to_wall(frame.to_world(np.stack([x, y, raster.height[row, column].astype(np.float64)], axis=1))))
+    points = np.concatenate(places)
+    check_some_inside(StableRock(tuple(areas), frames[0]).contains(points), points[:, 0], points[:, 1], "--stable")
 
 
 def _check_extent(data: EpochData, options: MonitorOptions, name: str) -> None:

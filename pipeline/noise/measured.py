@@ -83,13 +83,7 @@ def read_measured(folder: Path, config: DifferenceConfig, icp: IcpConfig | None,
     """
     if (folder / FILE).is_file():
         return _from_points(folder, config, icp, random)
-    files = sorted(folder.glob("difference_*.tif")) or sorted(folder.glob("*.tif"))
-    if not files:
-        raise InputError(
-            "the folder contains no measured epochs",
-            where=str(folder),
-            remedy="name a folder with measurement.yaml or with difference maps (*.tif)",
-        )
+    files = map_files(folder)
     maps, grids = zip(*map(read_geotiff, files), strict=True)
     for file, grid in zip(files, grids, strict=True):
         if grid != grids[0]:
@@ -99,6 +93,21 @@ def read_measured(folder: Path, config: DifferenceConfig, icp: IcpConfig | None,
                 remedy="resample all maps to the same origin, pixel size and shape",
             )
     return MeasuredMaps(folder.name, grids[0], np.stack(maps), None)
+
+
+def map_files(folder: Path) -> list[Path]:
+    """Return the GeoTIFFs of measured epochs in a folder, by name: difference_*.tif, or all *.tif if none has such a name.
+
+    Raises InputError if there are none.
+    """
+    files = sorted(folder.glob("difference_*.tif")) or sorted(folder.glob("*.tif"))
+    if not files:
+        raise InputError(
+            "the folder contains no measured epochs",
+            where=str(folder),
+            remedy="name a folder with measurement.yaml or with difference maps (*.tif)",
+        )
+    return files
 
 
 def _from_points(folder: Path, config: DifferenceConfig, icp: IcpConfig | None, random: KeyedRandom) -> MeasuredMaps:

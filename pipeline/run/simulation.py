@@ -42,6 +42,7 @@ from pipeline.run.site import SensorSite, prepare_site
 from scene.common.backend import VARIANT
 from scene.common.errors import InputError
 from scene.common.keyed_random import KeyedRandom
+from scene.meshes.winding import CHECK_SIDE
 from scene.walls.imported import ImportedWall
 
 SCHEMA = 1
@@ -58,11 +59,14 @@ class RunSummary:
         Folder of the run, and its report.html.
     epochs : list of dict
         Record of each finished epoch, as in run.json: number of points, registration, statistics of the difference map, blocks.
+    notes : tuple of str
+        What the user should check, in words.
     """
 
     folder: Path
     report: Path
     epochs: list[dict[str, Any]]
+    notes: tuple[str, ...] = ()
 
 
 @dataclass
@@ -318,4 +322,4 @@ def _finish(run: _Run, site: SensorSite, *, complete: bool) -> RunSummary:
         "seconds": run.progress.timings,
     }
     write_json(out / RUN_FILE, record)
-    return RunSummary(out, report, records)
+    return RunSummary(out, report, records, tuple(f"{site.name}: {each}" for each in site.repairs if CHECK_SIDE in each))

@@ -9,9 +9,9 @@ from typing import Annotated, Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Discriminator, Field, Tag
+from pydantic import Discriminator, Field, Tag, field_validator
 
-from scene.blocks.distributions import Distribution, Gaussian
+from scene.blocks.distributions import Distribution, Gaussian, highest
 from scene.common.config import Config
 from scene.common.errors import InputError
 from scene.common.keyed_random import KeyedRandom
@@ -75,6 +75,15 @@ class RockfallConfig(Config):
     safe_zone_offset_m: float = Field(0.5, ge=0, description="distance of blocks from the wall's border and its holes")
     minimum_distance_m: float = Field(0.1, ge=0, description="distance between the bounding boxes of two blocks, in x or in y")
     maximum_attempts: int = Field(2000, ge=1, description="positions tried for a block before giving up")
+
+    @field_validator("size_m")
+    @classmethod
+    def _above_zero(cls, sizes: AxisDistributions) -> AxisDistributions:
+        """Refuse lengths that are never above 0; a single length of 0 or less is refused where it is drawn."""
+        for axis in sizes if isinstance(sizes, tuple) else (sizes,):
+            if highest(axis) <= 0:
+                raise ValueError(f"lengths must be above 0 m, but are {highest(axis):g} m at most")
+        return sizes
 
 
 HEIGHTS = {"relief": highest_under, "highest_vertex": highest_vertex_under, "mean_surface": median_under}

@@ -10,6 +10,7 @@ Values carry the unit of the key that they stand under.
 
 from __future__ import annotations
 
+import math
 from typing import Annotated, Any, Literal, Self
 
 import numpy as np
@@ -166,5 +167,24 @@ Distribution = Annotated[
     BeforeValidator(_constant_from_number),
 ]
 """Type of a config key that accepts any of the distributions or a plain number."""
+
+
+def highest(distribution: Distribution) -> float:
+    """Return the largest value that a distribution can give, in its unit; infinite if it has no upper limit."""
+    match distribution:
+        case Constant():
+            return distribution.value
+        case Uniform():
+            return distribution.high
+        case Histogram():
+            return max(edge for edge, count in zip(distribution.edges[1:], distribution.counts, strict=True) if count > 0)
+        case Mixture():
+            parts = zip(distribution.components, distribution.weights, strict=True)
+            return max(highest(component) for component, weight in parts if weight > 0)
+        case Gaussian(sigma=0):
+            return distribution.mean
+        case _:
+            return math.inf
+
 
 Mixture.model_rebuild()

@@ -17,7 +17,7 @@ from pydantic_core import ErrorDetails
 
 from scene.common.errors import InputError, nearest
 from scene.common.regular_file import read_json, read_text
-from scene.common.yaml_text import parse_yaml
+from scene.common.yaml_text import parse_yaml, yaml_problem
 
 
 class Config(BaseModel):
@@ -85,11 +85,10 @@ def load_yaml(path: Path) -> Any:
     try:
         return parse_yaml(read_text(path, most_bytes=_MOST_YAML_BYTES, if_too_large="give it as .json, which is fast"))
     except yaml.YAMLError as error:
-        problem = " ".join(str(error).split())
         raise InputError(
-            f"the file is not valid YAML: {problem}",
+            f"the file is not valid YAML: {yaml_problem(error)}",
             where=str(path),
-            remedy="correct the syntax in the line that is named",
+            remedy="correct the syntax there",
         ) from None
 
 

@@ -92,6 +92,15 @@ def parse_yaml(text: str) -> Any:
         raise yaml.YAMLError("nested too deeply") from None
 
 
+def yaml_problem(error: yaml.YAMLError) -> str:
+    """Describe an error of `parse_yaml` in one line, with the line and column of the text if they are known, both from 1."""
+    problem, mark = getattr(error, "problem", None), getattr(error, "problem_mark", None)
+    if problem is None or mark is None:
+        return " ".join(str(error).split()).replace('in "<unicode string>", ', "at ")
+    context = getattr(error, "context", None)
+    return f"line {mark.line + 1}, column {mark.column + 1}: {problem}" + (f" ({context})" if context else "")
+
+
 def yaml_line(value: Any) -> str:
     """Write plain data (dict, list, str, numbers, booleans, None) as one line of YAML, which `parse_yaml` reads back."""
     text = yaml.dump(value, Dumper=_Dumper, default_flow_style=True, width=10**9, allow_unicode=True, sort_keys=False)

@@ -16,6 +16,8 @@ _FARTHEST_M = 1e5
 """No sensor for rock walls measures farther than this."""
 _GEOCENTRIC_M = 6.3e6, 6.5e6
 """Smallest and largest distance of sensors on the earth's surface from its centre."""
+CHECK_SIDE = "check that the sensor stands in front of the wall, not behind it"
+"""What a user should do if every triangle had to be turned: either the mesh or the sensor's position is wrong."""
 
 
 def orient_to_sensors(
@@ -59,8 +61,8 @@ def orient_to_sensors(
     backs = _pieces_seen_from_behind(scene, welded, viewpoints, where)
     if backs.any():
         mesh = flip_faces(mesh, backs)
-        part = "all" if backs.all() else "a piece of"
-        words.append(f"{part} {int(backs.sum())} triangles turned, as they were wound away from the sensor")
+        part, remedy = ("all", f"; {CHECK_SIDE}") if backs.all() else ("a piece of", "")
+        words.append(f"{part} {int(backs.sum())} triangles turned, as they were wound away from the sensor{remedy}")
     return mesh, "; ".join(words)
 
 

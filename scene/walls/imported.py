@@ -36,6 +36,9 @@ _Y_UP = {"glb", "gltf"}
 """Formats whose standard says that y points up (glTF 2.0, section 3.4). They are rotated so that z does."""
 _ARCHIVES = {"zip", "tar.gz", "tar.bz2", "bz2"}
 """Archive formats that trimesh lists among its mesh formats."""
+_CLOUDS = {"las", "laz", "e57", "ptx", "pts", "pcd"}
+"""Formats of point clouds."""
+_MESH_FIRST = "mesh the points first: scarpsim surface CLOUD --seen-from X Y Z --out wall.ply"
 _COLOURS = ("red", "green", "blue")
 """Names of the vertex colours in a PLY file."""
 _TEXTURE = {"texcoord", "texture_u", "texture_v", "s", "t", "u", "v"}
@@ -150,6 +153,15 @@ def read_reference(path: Path) -> tuple[TriangleMesh, tuple[str, ...]]:
     return mesh, (*notes, *([words] if words else []))
 
 
+def check_mesh_file(path: Path) -> None:
+    """Raise InputError if a file is no mesh, or if its coordinates are not finite.
+
+    Size and position are not checked, because they need the unit of the coordinates.
+    """
+    mesh = _read(path, None)
+    _require(np.all(np.isfinite(mesh.vertices), axis=1), mesh, "are not finite", str(path), "finite coordinates")
+
+
 def read_mesh(path: Path, unit: str = "m") -> tuple[TriangleMesh, tuple[str, ...]]:
     """Read a triangle mesh from a file; return it, converted to m, and notes on its coordinates for a report.
 
@@ -171,10 +183,10 @@ def _extent(mesh: TriangleMesh) -> float:
     return max(float(np.ptp(column[used])) for column in mesh.vertices.T)
 
 
-def _read(path: Path, unit: str) -> TriangleMesh:
+def _read(path: Path, unit: str | None) -> TriangleMesh:
     """Read a file's triangles unchanged, in the file's unit; all meshes of a scene are joined.
 
-    Raises InputError if the file cannot be read or states another unit than `unit`.
+    Raises InputError if the file cannot be read or states another unit than `unit`; None: any unit is accepted.
     """
     where, kind = str(path), _format(path)
     if not path.exists():
@@ -212,7 +224,7 @@ def _read(path: Path, unit: str) -> TriangleMesh:
         raise InputError(
             "the file contains no triangles",
             where=where,
-            remedy="mesh the points first: scarpsim surface CLOUD --seen-from X Y Z --out wall.ply",
+            remedy=_MESH_FIRST,
         )
     vertices = np.asarray(mesh.vertices, dtype=np.float64)
     if kind in _Y_UP and vertices.shape[1:] == (3,):
@@ -234,13 +246,13 @@ def _read(path: Path, unit: str) -> TriangleMesh:
     return TriangleMesh(vertices, faces.astype(np.int32), _albedo(mesh))
 
 
-def _obj_text(path: Path, unit: str) -> bytes:
+def _obj_text(path: Path, unit: str | None) -> bytes:
     """Return the text of an OBJ file.
 
     Raises OSError if the file cannot be read, and InputError if a comment in it names another unit than `unit`.
     """
     text = path.read_bytes()
-    stated = obj.unit_in_comments(text)
+    stated = None if unit is None else obj.unit_in_comments(text)
     if stated is not None and stated[0] != unit:
         raise InputError(
             f"the file says in a comment that its unit is {stated[0]} ('{stated[1][:80]}'), but `unit` says {unit}",
@@ -305,7 +317,7 @@ def _format(path: Path) -> str:
             f"'{path.suffix}' is not a mesh format that can be read",
             where=str(path),
             allowed=", ".join(known),
-            remedy=nearest(kind, known) or "convert the mesh to one of these formats",
+            remedy=_MESH_FIRST if kind in _CLOUDS else nearest(kind, known) or "convert the mesh to one of these formats",
         )
     return kind
 

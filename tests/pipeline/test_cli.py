@@ -39,6 +39,7 @@ class Pipeline:
         self.ran: tuple[Any, ...] = ()
         self.error: BaseException | None = None
         self.words = ""
+        self.notes: tuple[str, ...] = ()
 
     def load_config(self, *arguments: Any) -> str:
         self.loaded = arguments
@@ -51,7 +52,7 @@ class Pipeline:
         with progress.stage("wall"):
             if self.error:
                 raise self.error
-        return SimpleNamespace(report=arguments[2] / "report.html")
+        return SimpleNamespace(report=arguments[2] / "report.html", notes=self.notes)
 
 
 @pytest.fixture
@@ -69,6 +70,12 @@ def pipeline(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Pipeline:
 
 
 SIMULATE = ["simulate", "--sensor", "tls", "--config", "my.yaml", "--out", "here"]
+
+
+def test_simulate_prints_what_the_user_should_check(pipeline: Pipeline, capsys: pytest.CaptureFixture[str]) -> None:
+    pipeline.notes = ("wall: all 2 triangles turned",)
+    assert cli.main(SIMULATE) == 0
+    assert capsys.readouterr().out == "note: wall: all 2 triangles turned\nreport: here/report.html\n"
 
 
 def test_simulate_hands_everything_on(pipeline: Pipeline, capsys: pytest.CaptureFixture[str]) -> None:

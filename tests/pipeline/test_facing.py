@@ -91,6 +91,7 @@ def test_triangles_without_common_vertices_are_one_surface() -> None:
     turned, words = orient_to_sensors(wound(soup), [EYE], "wall")
     np.testing.assert_array_equal(turned.faces, soup.faces)
     assert words.startswith("all 70 triangles turned")
+    assert words.endswith("check that the sensor stands in front of the wall, not behind it")
 
 
 def test_a_closed_surface_is_turned_only_where_it_is_wound_inwards() -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -209,7 +210,8 @@ def test_the_noise_of_a_cloud_is_found(share: float, wall: Path, tmp_path: Path)
 
 def test_meshes_and_elevation_models_are_taken_as_they_are(coarse: Path, tmp_path: Path) -> None:
     """The vertices of a mesh and the pixels of an elevation model are used as points."""
-    found = build_surface(Request([coarse], str(coarse)), tmp_path / "mesh")
+    copy = shutil.copy(coarse, tmp_path / "copy.ply")
+    found = build_surface(Request([coarse], str(copy)), tmp_path / "mesh")
     assert "the vertices of a mesh" in found.about["points"][0]
     grid = Grid(0.0, 8.0, 0.1, 120, 80)
     x, y = np.meshgrid((np.arange(120) + 0.5) * 0.1, 8.0 - (np.arange(80) + 0.5) * 0.1)

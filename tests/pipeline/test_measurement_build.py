@@ -200,7 +200,8 @@ def test_half_of_a_scan_is_compared_with_the_other(case: Case, tmp_path: Path) -
 def test_another_epoch_is_meshed_as_the_scanner_sees_it(case: Case, tmp_path: Path) -> None:
     path = as_laz(case, tmp_path)
     np.savetxt(tmp_path / "before.xyz", in_world(case), fmt="%.6f")
-    found = build(Request([path, tmp_path / "before.xyz"], str(tmp_path / "before.xyz"), "riegl_vz400i"), tmp_path / "out")
+    np.savetxt(tmp_path / "later.xyz", in_world(case), fmt="%.6f")
+    found = build(Request([path, tmp_path / "later.xyz"], str(tmp_path / "before.xyz"), "riegl_vz400i"), tmp_path / "out")
     measurement = read_measurement(tmp_path / "out")
     assert set(measurement.epochs) == {0, 1}
     assert "errors that both share" in found.about["cannot show"][0]

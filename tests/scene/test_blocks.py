@@ -226,7 +226,7 @@ def test_a_coarse_wall_of_two_triangles() -> None:
         ({"count": 100, "maximum_attempts": 8}, "no room was found for a block of .* blocks have a place.*lower count"),
         ({"size_m": 30.0}, "40 of 40 blocks are larger than the wall.*allowed: below 11.9"),
         ({"safe_zone_offset_m": 5.0}, "leaves no room on a wall"),
-        ({"size_m": -0.1}, "a length of -0.1 m was drawn"),
+        ({"size_m": {"kind": "gaussian", "mean": -0.1, "sigma": 1e-6}}, "a length of -0.1 m was drawn"),
         ({"count": 0}, "count"),
         ({"maximum_attempt": 3}, "did you mean 'maximum_attempts'"),
         ({"size_m": [0.1, 0.2]}, "size_m"),

@@ -8,7 +8,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field, model_validator
 
-from pipeline.config.overrides import apply_overrides
+from pipeline.config.overrides import Override, apply_overrides, read_with_overrides
 from scene.common.config import Config, load_yaml, parse
 
 CHECKPOINT, BEST, STAGE, EVENTS, CURVES = "checkpoint", "best", "stage", "events", "losses.png"
@@ -210,4 +210,8 @@ def load_train_config(path: Path, overrides: Sequence[str] = ()) -> TrainConfig:
     path: YAML file. overrides: changes of its values, `key.path=value`. Raises InputError for any mistake.
     """
     values = load_yaml(path) or {}
-    return parse(TrainConfig, apply_overrides(values, overrides) if isinstance(values, dict) else values, where=str(path))
+
+    def read(changes: Sequence[str | Override]) -> TrainConfig:
+        return parse(TrainConfig, apply_overrides(values, changes) if isinstance(values, dict) else values, where=str(path))
+
+    return read_with_overrides(read, overrides, str(path))

@@ -182,7 +182,10 @@ def check_place(out: Path) -> None:
             raise PermissionError(errno.EACCES, os.strerror(errno.EACCES))
     except (OSError, ValueError) as error:  # ValueError: a null character
         reason = getattr(error, "strerror", None) or "a null character in its name"
-        raise InputError(f"the path cannot be used as a folder ({reason})", where=f"--out {out}", remedy=_ELSEWHERE) from None
+        problem = "the path cannot be used as a folder"
+        if made and "\0" not in str(out):
+            problem += f": no folder can be created in {_existing(out)}"
+        raise InputError(f"{problem} ({reason})", where=f"--out {out}", remedy=_ELSEWHERE) from None
     finally:
         _remove_empty(made)
 

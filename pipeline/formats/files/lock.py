@@ -10,7 +10,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import TextIO
 
-from pipeline.formats.files.atomic import explained
+from pipeline.formats.files.atomic import check_place, explained
 from scene.common.errors import InputError
 
 LOCK = ".lock"
@@ -25,6 +25,7 @@ def locked(folder: Path) -> Iterator[None]:
     """
     if folder.exists() and not folder.is_dir():
         raise InputError("the path is a file, but the results need a folder", where=f"--out {folder}", remedy="choose a folder")
+    check_place(folder)
     missing = [each for each in (folder, *folder.parents) if not each.exists()]
     path = folder / LOCK
     with explained(path):

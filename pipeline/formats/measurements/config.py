@@ -108,6 +108,11 @@ class MeasurementConfig(Config):
         (), description="notes on the measurement for the report, such as what a reference cannot show"
     )
 
+    @property
+    def files(self) -> list[Path]:
+        """The files of points, one or several."""
+        return [self.points] if isinstance(self.points, Path) else self.points
+
     @field_validator("points")
     @classmethod
     def _some(cls, points: Path | list[Path]) -> Path | list[Path]:
@@ -121,12 +126,14 @@ class MeasurementConfig(Config):
     @model_validator(mode="after")
     def _fits(self) -> Self:
         """Check that keys fit the sensor and each other."""
+        if self.reference in self.files:
+            raise ValueError("'reference' and 'points' name the same file, which cannot differ from itself; name another one")
         for name in ("incidence", "reference_error_m", "reference_error_kind"):
             if self.sensor == "stereo" and getattr(self, name) is not None:
                 raise ValueError(f"'{name}' is for laser scans only; remove it")
-        files = [self.points] if isinstance(self.points, Path) else self.points
-        if self.scanners and len(self.scanners) != len(files):
-            raise ValueError(f"'scanners' has {len(self.scanners)} poses for {len(files)} files of points; give one for each")
+        if self.scanners and len(self.scanners) != len(self.files):
+            problem = f"'scanners' has {len(self.scanners)} poses for {len(self.files)} files of points; give one for each"
+            raise ValueError(problem)
         if self.scanners and (self.scanner is not None or self.pattern is not None):
             raise ValueError("'scanners' replaces 'scanner' and excludes 'pattern'")
         return self

@@ -12,7 +12,7 @@ from typing import Any, ClassVar, Literal, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.change.areas import Area, in_areas
+from pipeline.change.areas import Area, check_some_inside, in_areas
 from pipeline.formats.cameras.camera_files import read_oriented, stereo_pair
 from pipeline.formats.cameras.cameras import read_cameras_yaml
 from pipeline.formats.measurements.checks import (
@@ -332,7 +332,7 @@ def read_measurement(folder: Path) -> Measurement:
     check_sensor(config.sensor, model.sensor, str(path))
     cameras = _cameras(config, base)
     mesh, notes = read_reference(base / config.reference)
-    points = {str(base / name): read_points(base / name) for name in _files(config)}
+    points = {str(base / name): read_points(base / name) for name in config.files}
     notes = (*notes, *_mended(config, values))
     return assembled(config, Material(mesh, points, model, cameras, notes), str(base / config.reference), str(path))
 
@@ -414,12 +414,13 @@ def _scanner_pose(config: MeasurementConfig, where: str) -> ScannerPose:
 
 
 def _check(found: Measurement, cloud: PointCloud, config: MeasurementConfig, where: str) -> None:
-    """Raise InputError if the points (`cloud`: as read) fit neither pattern nor reference."""
+    """Raise InputError if the points (`cloud`: as read) fit neither pattern nor reference, or no stable area has points."""
+    check_some_inside(found.stable, found.cloud.points[:, 0], found.cloud.points[:, 1], f"{where}: stable_areas")
     if isinstance(found, SurfaceMeasurement):
         found.check_near(where)
         return
     if config.pattern is not None:
-        check_pulses(config.pattern.azimuth_rad, config.pattern.zenith_rad, len(cloud.points), len(_files(config)), where)
+        check_pulses(config.pattern.azimuth_rad, config.pattern.zenith_rad, len(cloud.points), len(config.files), where)
     here, other = found.fit, None
     if not here.good and config.scanner is not None:
         unsaid: Literal["scanner", "world"] = "world" if config.frame == "scanner" else "scanner"
@@ -429,10 +430,6 @@ def _check(found: Measurement, cloud: PointCloud, config: MeasurementConfig, whe
         position, rotation = found.station
         local = np.einsum("ji,nj->ni", rotation, found.cloud.points - position)
         check_inside(local, config.pattern.azimuth_rad, config.pattern.zenith_rad, where)
-
-
-def _files(config: MeasurementConfig) -> list[Path]:
-    return [config.points] if isinstance(config.points, Path) else config.points
 
 
 def _cameras(config: MeasurementConfig, base: Path) -> CameraPair | None:

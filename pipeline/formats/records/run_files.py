@@ -39,6 +39,9 @@ class RunFiles:
     @cached_property
     def record(self) -> dict[str, Any]:
         """Content of run.json, the record of the simulation, as `read_run` checks it."""
+        if not (self.folder / RUN_FILE).exists():
+            problem = f"the folder contains no run ({RUN_FILE} is missing)" if self.folder.is_dir() else "there is no such folder"
+            raise InputError(problem, where=str(self.folder), remedy="give the folder that scarpsim simulate wrote")
         return read_run(self.folder / RUN_FILE, RESUME)
 
     def surface(self, number: int, name: str = "surface") -> TriangleMesh:
