@@ -40,7 +40,7 @@ from pipeline.gap.naming.workflow import diagnose
 from pipeline.gap.noise_and_edges.variance_model import VarianceTerm, fit_variance_model
 from pipeline.gap.residuals.alignment import align, fit_pose_robustly
 from pipeline.gap.residuals.residuals import Residuals
-from pipeline.gap.residuals.wall_blocks import WallBlocks, WallCells
+from pipeline.gap.residuals.wall_blocks import BlockGrid, WallCells
 from pipeline.gap.thresholds import Thresholds, use_thresholds
 from scene.common.keyed_random import KeyedRandom
 from scene.geometry.mesh import FloatArray
@@ -322,7 +322,7 @@ def test_the_effect_that_leaves_the_least_noise_ranks_first(tmp_path: Path, monk
         ("principal_point_x", "left"),
         ("principal_point_x", "right"),
     }
-    inputs = PassInputs(there, residuals, np.zeros(len(there.cloud.points), dtype=bool), WallBlocks(np.zeros(2), 1.0))
+    inputs = PassInputs(there, residuals, np.zeros(len(there.cloud.points), dtype=bool), BlockGrid(np.zeros(2), 1.0))
     without = PassInput.of(there, residuals, inputs.held_out_points, []).excluded_share
     with use_thresholds(_with_moved_share(0.01)):
         assert inputs.large_effect is not None
@@ -336,7 +336,7 @@ def test_rock_that_moved_is_no_large_effect(tmp_path: Path) -> None:
     """Every eighth point lies 1 m further away, which no effect of the sensor explains."""
     write_scan(tmp_path, 8, step_rad=0.007, ranges=lambda scan: scan.R + 1.0 * (np.arange(len(scan.R)) % 8 == 0))
     there, residuals, _ = align(read_measurement(tmp_path))
-    inputs = PassInputs(there, residuals, np.zeros(len(there.cloud.points), dtype=bool), WallBlocks(np.zeros(2), 1.0))
+    inputs = PassInputs(there, residuals, np.zeros(len(there.cloud.points), dtype=bool), BlockGrid(np.zeros(2), 1.0))
     assert PassInput.of(there, residuals, inputs.held_out_points, []).excluded_share > 0.1
     with use_thresholds(_with_moved_share(0.1)):
         assert inputs.large_effect is None

@@ -22,7 +22,7 @@ from pipeline.gap.noise_and_edges.disparity_edges import align_beside_fattening,
 from pipeline.gap.residuals.alignment import align, compute_residuals, fit_pose_robustly
 from pipeline.gap.residuals.disparity_raster import raster_cell_px
 from pipeline.gap.residuals.stereo_residuals import StereoResiduals
-from pipeline.gap.residuals.wall_blocks import WallBlocks
+from pipeline.gap.residuals.wall_blocks import BlockGrid
 from scene.common.keyed_random import KeyedRandom
 from sensors.effects import effect_of
 from sensors.effects.edge_fattening import EdgeFattening
@@ -73,7 +73,7 @@ def test_a_window_that_takes_the_nearest_rock_is_found_beside_its_pose(
     assert named.effect.step_px == pytest.approx(step_px, rel=0.25)
     assert named.effect.radius_px == pytest.approx(cells * step, abs=2 * named.std["radius_px"])
     inputs = PassInputs(
-        found.measurement, found.residuals, np.zeros(len(there.cloud.points), dtype=bool), WallBlocks(np.zeros(2), 1.0)
+        found.measurement, found.residuals, np.zeros(len(there.cloud.points), dtype=bool), BlockGrid(np.zeros(2), 1.0)
     )
     selection: Any = None
     (again,) = inputs.edge_effects_given(SelectionPass(inputs.with_these(inputs.edge_effects), [], selection))

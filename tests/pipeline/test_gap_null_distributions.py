@@ -22,7 +22,7 @@ from pipeline.gap.residuals.nominal_pair import PixelGeometry
 from pipeline.gap.residuals.ray_hits import RayGeometry
 from pipeline.gap.residuals.stereo_residuals import StereoResiduals
 from pipeline.gap.residuals.tls_residuals import TlsResiduals
-from pipeline.gap.residuals.wall_blocks import WallBlocks
+from pipeline.gap.residuals.wall_blocks import BlockGrid
 from scene.common.keyed_random import KeyedRandom
 from scene.geometry.mesh import FloatArray
 from sensors.effects.regularization_noise import RegularizationNoise
@@ -112,7 +112,7 @@ def test_of_a_mean_beside_long_waves_of_the_reference(monkeypatch: pytest.Monkey
 def of_the_spread(count: int, excess: float) -> list[float]:
     """Return p-values of a variance that grows over the wall, of one that is constant and of one of few points."""
     at = over_the_wall()
-    block = WallBlocks(np.zeros(2), 0.45).numbers(at)
+    block = BlockGrid(np.zeros(2), 0.45).numbers(at)
     forms = [np.ones(len(at)), at[:, 0], np.exp(-at[:, 1])]
     found = []
     for seed in range(count):

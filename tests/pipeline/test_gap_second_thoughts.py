@@ -33,7 +33,7 @@ from pipeline.gap.residuals.alignment import align, at_points_of, compute_residu
 from pipeline.gap.residuals.disparity_raster import DisparityRaster
 from pipeline.gap.residuals.nominal_pair import NominalPair, real_pair
 from pipeline.gap.residuals.stereo_residuals import stereo_residuals
-from pipeline.gap.residuals.wall_blocks import WallBlocks
+from pipeline.gap.residuals.wall_blocks import BlockGrid
 from scene.common.keyed_random import KeyedRandom
 from sensors.effects.edge_fattening import EdgeFattening
 from sensors.effects.smoothing import Smoothing
@@ -93,7 +93,7 @@ def test_where_a_free_form_fails_all_is_named_again_without_any(
     monkeypatch.setattr(workflow, "only_within_bounds", lambda _, items: (items, []))
     monkeypatch.setattr(workflow, "_with_heavy_tails", lambda *given: (given[1], None))
     monkeypatch.setattr(workflow, "with_separating_measurements", lambda _, items: items)
-    found = workflow._select_and_validate(PassInputs(there, plain, nowhere, WallBlocks(np.zeros(2), 1.0)), KeyedRandom(1))
+    found = workflow._select_and_validate(PassInputs(there, plain, nowhere, BlockGrid(np.zeros(2), 1.0)), KeyedRandom(1))
     assert [item.name for item in found.named] == kept
     assert found.words == ["tls.range_empirical dropped: it does not improve the validation blocks"]
     assert seen == [False, True]

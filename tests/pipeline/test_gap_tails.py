@@ -13,7 +13,7 @@ from pipeline.gap.naming import effect_selection, workflow
 from pipeline.gap.naming.effect_selection import keep_implausible_in_class
 from pipeline.gap.naming.named_effects import NamedEffect, absorbed_by_registration
 from pipeline.gap.noise_and_edges.heavy_tails import find_heavy_tails
-from pipeline.gap.residuals.wall_blocks import WallBlocks
+from pipeline.gap.residuals.wall_blocks import BlockGrid
 from sensors.effects.range_noise import RangeNoise
 
 POINTS, BLOCKS = 30_000, 100
@@ -63,7 +63,7 @@ def test_noise_for_far_points_explains_the_scatter_of_all(monkeypatch: pytest.Mo
     monkeypatch.setattr(workflow, "only_within_bounds", lambda _, effects: (effects, []))
     noise = [NamedEffect("tls.range_noise_incidence", "physical", {"name": "range_noise_incidence"}, {}, (), None, 9.0)] * named
     there: Any = SimpleNamespace(model=None)
-    (heavy,), _ = workflow._with_heavy_tails(there, noise, WallBlocks(np.zeros(2), 1.0))
+    (heavy,), _ = workflow._with_heavy_tails(there, noise, BlockGrid(np.zeros(2), 1.0))
     scatter = 0.003 * np.sqrt(np.mean(np.minimum(z**2, 144.0)))
     assert np.hypot(base, heavy.entry["sigma_m"]) == pytest.approx(scatter, rel=1e-6)
 

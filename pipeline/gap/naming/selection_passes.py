@@ -30,7 +30,7 @@ from pipeline.gap.residuals.scene_changes import SceneChange, drop_duplicates, f
 from pipeline.gap.residuals.sensor_view import SensorView
 from pipeline.gap.residuals.stereo_residuals import StereoResiduals
 from pipeline.gap.residuals.tls_residuals import TlsResiduals
-from pipeline.gap.residuals.wall_blocks import WallBlocks
+from pipeline.gap.residuals.wall_blocks import BlockGrid
 from pipeline.gap.thresholds import thresholds
 from scene.common.keyed_random import KeyedRandom
 from scene.geometry.mesh import FloatArray
@@ -229,7 +229,7 @@ class PassInputs:
     measurement: Measurement
     plain: Residuals
     held_out_points: BoolArray
-    blocks: WallBlocks
+    blocks: BlockGrid
 
     @cached_property
     def _without_effects(self) -> PassInput:

@@ -19,7 +19,7 @@ from pipeline.gap.noise_and_edges.sign_flips import DRAWS
 from pipeline.gap.residuals.alignment import fit_pose
 from pipeline.gap.residuals.correlated_noise import GridCorrelatedNoise, NodeField
 from pipeline.gap.residuals.residuals import BoolArray, Residuals
-from pipeline.gap.residuals.wall_blocks import WallBlocks, wall_blocks_by_points
+from pipeline.gap.residuals.wall_blocks import BlockGrid, wall_blocks_by_points
 from pipeline.gap.thresholds import thresholds
 from scene.common.keyed_random import KeyedRandom
 from scene.geometry.mesh import FloatArray
@@ -69,7 +69,7 @@ def validate_effects(
     named: list[NamedEffect],
     training: BoolArray,
     reference_sigma: float,
-    blocks: WallBlocks,
+    blocks: BlockGrid,
 ) -> ValidatedEffects:
     """Test whether each named effect (sensor error) improves the likelihood of parts of the wall that no fit used.
 

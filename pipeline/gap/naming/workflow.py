@@ -56,7 +56,7 @@ from pipeline.gap.residuals.stereo_residuals import StereoResiduals, with_surrou
 from pipeline.gap.residuals.subsampling import subsample_measurement
 from pipeline.gap.residuals.surface_residuals import SurfaceResiduals
 from pipeline.gap.residuals.tls_residuals import TlsResiduals, find_expected_pulses, with_scan_order
-from pipeline.gap.residuals.wall_blocks import WallBlocks, WallCells
+from pipeline.gap.residuals.wall_blocks import BlockGrid, WallCells
 from pipeline.gap.thresholds import Thresholds, thresholds, use_thresholds
 from scene.common.keyed_random import KeyedRandom
 from scene.geometry.mesh import FloatArray
@@ -211,7 +211,7 @@ def _diagnose(measurement: Measurement, clock: _Clock, random: KeyedRandom) -> G
     )
 
 
-def _aligned(measurement: Measurement) -> tuple[Measurement, Residuals, FloatArray, BoolArray, WallBlocks]:
+def _aligned(measurement: Measurement) -> tuple[Measurement, Residuals, FloatArray, BoolArray, BlockGrid]:
     """Estimate the pose and compute the residuals.
 
     Returns
@@ -381,7 +381,7 @@ def _select_and_validate(
 
 
 def _validate(
-    aligned: Measurement, given: PassInput, named: list[NamedEffect], reference_sigma: float, blocks: WallBlocks
+    aligned: Measurement, given: PassInput, named: list[NamedEffect], reference_sigma: float, blocks: BlockGrid
 ) -> ValidatedEffects:
     """Score the effects on the validation points."""
     tested = subsample_rows(np.flatnonzero(given.stable & given.held_out))
@@ -392,7 +392,7 @@ def _validate(
 
 
 def _with_heavy_tails(
-    measurement: Measurement, named: list[NamedEffect], blocks: WallBlocks
+    measurement: Measurement, named: list[NamedEffect], blocks: BlockGrid
 ) -> tuple[list[NamedEffect], HeavyTails | None]:
     """Add heavy tails to the named effects if outliers lie all over the wall.
 
@@ -483,7 +483,7 @@ def _insufficient_data(measurement: Measurement, residuals: Residuals, pose: Flo
     )  # fmt: skip
 
 
-def _explain_losses(measurement: Measurement, given: PassInput, blocks: WallBlocks) -> tuple[LossExplanation, BoolArray] | None:
+def _explain_losses(measurement: Measurement, given: PassInput, blocks: BlockGrid) -> tuple[LossExplanation, BoolArray] | None:
     """Explain the missing returns, with the pulses that the explanation was not fitted to."""
     residuals = given.residuals
     missing = residuals.expected_pulses

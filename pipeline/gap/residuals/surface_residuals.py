@@ -18,7 +18,7 @@ from pipeline.formats.measurements.surface_datum import datum_columns
 from pipeline.formats.measurements.surface_fit import near_m
 from pipeline.gap.residuals.correlated_noise import GridCorrelatedNoise
 from pipeline.gap.residuals.residuals import BoolArray, Residuals, Rows
-from pipeline.gap.residuals.wall_blocks import WallBlocks
+from pipeline.gap.residuals.wall_blocks import BlockGrid
 from scene.common.keyed_random import KeyedRandom
 from scene.geometry.mesh import FloatArray
 from sensors.effects import Effects
@@ -278,7 +278,7 @@ def datum_covariance(residuals: SurfaceResiduals, value: FloatArray, rows: BoolA
     """
     part, left = residuals.part(rows), value[rows]
     extent = np.ptp(part.wall_xy, axis=0)
-    blocks = WallBlocks(part.wall_xy.min(axis=0), float(np.sqrt(np.prod(extent) / _JACKKNIFE_CELLS)))
+    blocks = BlockGrid(part.wall_xy.min(axis=0), float(np.sqrt(np.prod(extent) / _JACKKNIFE_CELLS)))
     _, number = np.unique(blocks.numbers(part.wall_xy), return_inverse=True)
     scale = np.linalg.norm(part.pose_jacobian / part.sigma[:, None], axis=0)
     columns = part.pose_jacobian / part.sigma[:, None] / scale

@@ -24,8 +24,8 @@ _ROWS_APART = 100_000
 
 
 @dataclass(frozen=True)
-class WallBlocks:
-    """Large squares of the wall, for spatial cross-validation and for resampling.
+class BlockGrid:
+    """Grid of large squares of the wall (wall blocks), for spatial cross-validation and for resampling.
 
     Errors may be correlated within a wall block, so all its points are used together, either for fitting or for validation.
 
@@ -83,7 +83,7 @@ class WallCells:
         """
         side = float(np.sqrt(np.prod(np.ptp(at, axis=0)) / _MOST_CELLS)) or 1.0
         origin = at.min(axis=0)
-        _, number, counts = np.unique(WallBlocks(origin, side).numbers(at), return_inverse=True, return_counts=True)
+        _, number, counts = np.unique(BlockGrid(origin, side).numbers(at), return_inverse=True, return_counts=True)
         kept = counts >= _FEWEST_POINTS
         renumbered = np.where(kept, np.cumsum(kept) - 1, -1)[number]
         inside = renumbered >= 0
@@ -96,9 +96,9 @@ class WallCells:
         return len(self.centre)
 
     @property
-    def blocks(self) -> WallBlocks:
+    def blocks(self) -> BlockGrid:
         """The wall blocks: squares of 3 by 3 cells, each of which is used as a whole, for fits or for validation."""
-        return WallBlocks(self.origin, _BLOCK_CELLS * self.side_m)
+        return BlockGrid(self.origin, _BLOCK_CELLS * self.side_m)
 
 
 def wall_blocks_by_points(at: FloatArray, points: float) -> NDArray[np.int64]:
@@ -114,4 +114,4 @@ def wall_blocks_by_points(at: FloatArray, points: float) -> NDArray[np.int64]:
     (n,) number of the wall block in which each point lies, counted from 0.
     """
     side = float(np.sqrt(np.prod(np.ptp(at, axis=0)) / max(len(at) / points, 1.0))) or 1.0
-    return np.asarray(np.unique(WallBlocks(at.min(axis=0), side).numbers(at), return_inverse=True)[1])
+    return np.asarray(np.unique(BlockGrid(at.min(axis=0), side).numbers(at), return_inverse=True)[1])
