@@ -114,7 +114,8 @@ class MeanThresholds(ThresholdGroup):
         0.01,
         "share of the log-likelihood ratio",
         "Effects whose score is within this share of the best one's log-likelihood ratio belong to its class too, noise terms "
-        "likewise. Beside other effects a candidate must gain at least this share of what it gains alone. No signature is "
+        "likewise. Beside other effects a candidate must gain at least this share of what it gains alone, and an empirical "
+        "term at least this share of what the strongest effect gains. No signature is "
         "exact, and the error grows with the ratio: 6 degrees between two signatures leave this share.",
         "geometry of small angles",
         lt=1,

@@ -35,7 +35,7 @@ from pipeline.gap.naming.search_beside_effects import _JointFit, fit_jointly, se
 from pipeline.gap.naming.search_outcome import SearchInput, SearchOutcome
 from pipeline.gap.naming.search_residuals import with_fitted_variance
 from pipeline.gap.naming.selection_passes import PassInput, PassInputs
-from pipeline.gap.naming.validation_scores import validate_effects
+from pipeline.gap.naming.validation_scores import describe_weakness, validate_effects
 from pipeline.gap.naming.workflow import diagnose
 from pipeline.gap.noise_and_edges.variance_model import VarianceTerm, fit_variance_model
 from pipeline.gap.residuals.alignment import align, fit_pose_robustly
@@ -430,6 +430,33 @@ def test_an_effect_from_which_few_blocks_gain_is_only_mentioned_beside_others(tm
     assert [item.name for item in both.named] == ["tls.range_incidence_bias"]
     assert [item.name for item in both.weak] == ["tls.range_scale"]
     assert 0 < both.weak[0].gain < 2
+
+
+@pytest.mark.parametrize(("amplitude_m", "named"), [(0.0004, False), (0.004, True)])
+def test_a_curve_beside_an_effect_that_gains_a_hundred_times_as_much_is_only_mentioned(
+    tmp_path: Path, amplitude_m: float, named: bool
+) -> None:
+    """The ranges grow with the incidence angle by centimetres, and by a wave, of 0.4 mm or 4 mm, that a curve describes."""
+    incidence = np.linspace(0.0, 1.4, 141)
+    wave = amplitude_m * np.sin(9 * incidence)
+    write_scan(
+        tmp_path,
+        8,
+        step_rad=0.007,
+        ranges=lambda scan: scan.R + 0.05 * (1 / scan.cos_i - 1) + amplitude_m * np.sin(9 * np.arccos(scan.cos_i)),
+    )
+    there, residuals, _ = align(read_measurement(tmp_path))
+    blocks = WallCells.over(residuals.wall_xy).blocks
+    curve = {"name": "range_empirical", "covariate": "incidence", "along": {"low": 0.0, "high": 1.4}, "values_m": [wave.tolist()]}
+    bias = {"name": "range_incidence_bias", "coefficient_m": 0.05}
+    effects = [
+        NamedEffect("tls.range_incidence_bias", "physical", bias, {}, (), 0.001, 9.0),
+        NamedEffect("tls.range_empirical", "empirical", curve, {}, (), 0.001, 9.0),
+    ]
+    scored = validate_effects(there, residuals, effects, ~blocks.for_validation(residuals.wall_xy), 0.0004, blocks)
+    assert not scored.failed
+    assert [item.name for item in scored.named] == ["tls.range_incidence_bias", "tls.range_empirical"][: 1 + named]
+    assert all("as little as another effect may be inexact" in describe_weakness(item) for item in scored.weak)
 
 
 def test_of_two_curves_with_one_name_only_the_wrong_one_fails(tmp_path: Path) -> None:

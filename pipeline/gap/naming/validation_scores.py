@@ -91,7 +91,7 @@ def validate_effects(
     -------
     ValidatedEffects : accepted effects; failed ones, which do not improve the likelihood; and weak ones, which improve it, but
         too little to be named beside others: by no more than `variance.least_gain`, in too few wall blocks (`verdict.block_p`),
-        or the effect's size is within its uncertainty of zero.
+        the effect's size is within its uncertainty of zero, or an empirical term may only describe what is inexact of another.
     """
     scorable = [item for item in named if item.effect.scored()]
     if not scorable or (~training).sum() < 100:
@@ -119,7 +119,9 @@ def validate_effects(
     failed = [item for item in scorable if total[id(item)] <= item.effect.held_out_gain]
     kept = [item for item in named if item not in failed]
     measured = [replace(item, gain=total.get(id(item), item.gain)) for item in kept]
-    weak = [each for each, item in zip(measured, kept, strict=True) if len(kept) > 1 and _is_weak(each, found.get(id(item)))]
+    gains_in_blocks = [found.get(id(item)) for item in kept]
+    most = max((item.gain for item in measured if item.kind == "physical"), default=0.0)
+    weak = [each for each, own in zip(measured, gains_in_blocks, strict=True) if len(kept) > 1 and _is_weak(each, own, most)]
     return ValidatedEffects([item for item in measured if item not in weak], failed, weak)
 
 
@@ -132,10 +134,16 @@ def _groups(effects: Sequence[NamedEffect]) -> list[tuple[NamedEffect, ...]]:
     return [*nested, *combinations(effects, 2)]
 
 
-def _is_weak(item: NamedEffect, gains: FloatArray | None) -> bool:
-    """Whether an effect beside others gains too little, or in too few wall blocks, to be named, or may be of size zero."""
-    if item.kind != "physical" or gains is None:
+def _is_weak(item: NamedEffect, gains: FloatArray | None, most: float) -> bool:
+    """Whether an effect beside others gains too little, or in too few wall blocks, to be named, or may be of size zero.
+
+    An empirical term must gain more than the inexact part (`mean.class_share`) of the effect of the catalogue that gains most,
+    because it may describe no more than that. most: what that effect gains.
+    """
+    if gains is None:
         return False
+    if item.kind != "physical":
+        return not item.adds_variance and item.gain < thresholds().mean.class_share * most
     return item.gain <= thresholds().variance.least_gain or _is_consistent_with_zero(item) or not blocks_agree(gains)
 
 
@@ -157,8 +165,10 @@ def describe_weakness(item: NamedEffect) -> str:
     """Say in the report why an effect (sensor error) is mentioned but not named, although it improves the predictions.
 
     item: an effect whose size is consistent with zero, whose log-likelihood ratio on validation blocks is too small, or on which
-        these blocks do not agree.
+        these blocks do not agree; or an empirical term that gains next to nothing beside another effect.
     """
+    if item.kind != "physical":
+        return f"it gains only {item.gain:.1f} in log-likelihood on validation blocks, as little as another effect may be inexact"
     if _is_consistent_with_zero(item):
         return "its value is within its uncertainty of zero"
     if item.gain <= thresholds().variance.least_gain:
