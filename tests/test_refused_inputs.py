@@ -205,7 +205,7 @@ def test_monitor_checks_stable_areas_on_the_reference(area: str, *, kept: bool, 
     if kept:
         assert prepared(sources[0], options).grid.width > 0
     else:
-        with pytest.raises(InputError, match="--stable: all areas lie outside the measured wall"):
+        with pytest.raises(InputError, match="--stable: no measured point lies in any of the areas"):
             monitor(sources, tmp_path / "out", options)
         assert not (tmp_path / "out").exists()
 

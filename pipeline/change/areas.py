@@ -50,7 +50,7 @@ def in_areas(areas: Iterable[Area], x: FloatArray, y: FloatArray) -> NDArray[np.
 
 
 def check_some_inside(inside: NDArray[np.bool_], x: FloatArray, y: FloatArray, where: str) -> None:
-    """Raise InputError if none of the user's areas contains any place of the wall.
+    """Raise InputError if none of the user's areas contains a measured point.
 
     Parameters
     ----------
@@ -63,10 +63,11 @@ def check_some_inside(inside: NDArray[np.bool_], x: FloatArray, y: FloatArray, w
     """
     if inside.any() or not len(x):
         return
+    wall = f"x {x.min():.1f} to {x.max():.1f} m and y {y.min():.1f} to {y.max():.1f} m"
     raise InputError(
-        "all areas lie outside the measured wall",
+        "no measured point lies in any of the areas",
         where=where,
-        allowed=f"areas that overlap x {x.min():.1f} to {x.max():.1f} m and y {y.min():.1f} to {y.max():.1f} m of the wall frame",
+        allowed=f"areas that hold points; the wall has {wall} in the wall frame",
         remedy="correct the coordinates of the areas: x runs along the wall and y up the wall, from the corner of the maps",
     )
 

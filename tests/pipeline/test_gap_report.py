@@ -146,7 +146,7 @@ def test_nothing_is_written_where_the_report_cannot_be_made(
     assert not (tmp_path / "out").exists()
 
 
-@pytest.mark.parametrize(("count", "areas"), [(1, []), (3, []), (50, []), (300, []), (None, [[20.0, 10.0, 20.5, 10.5]])])
+@pytest.mark.parametrize(("count", "areas"), [(1, []), (3, []), (50, []), (300, []), (None, [[20.0, 10.0, 24.0, 14.0]])])
 def test_too_few_points_are_answered_with_what_to_measure(
     count: int | None, areas: list[list[float]], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
