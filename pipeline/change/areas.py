@@ -19,13 +19,14 @@ Vertex = tuple[float, float]
 def _check_shape(area: Any) -> Any:
     """Refuse anything that is neither a box nor a polygon."""
     try:
-        shape = np.array(area, dtype=np.float64).shape
+        corners = np.array(area, dtype=np.float64)
     except (TypeError, ValueError):
-        shape = ()
+        corners = np.zeros(())
+    shape = corners.shape
     if shape != (4,) and not (len(shape) == 2 and shape[0] >= 3 and shape[1] == 2):
         raise ValueError("is neither a box [x0, y0, x1, y1] nor a polygon [[x, y], [x, y], [x, y], ...]")
-    if shape == (4,) and not (area[0] < area[2] and area[1] < area[3]):
-        raise ValueError("is a box [x0, y0, x1, y1] without extent: x0 must be below x1 and y0 below y1; exchange the corners")
+    if shape == (4,) and not (corners[:2] < corners[2:]).all():
+        raise ValueError("is a box [x0, y0, x1, y1] without extent: x0 must be below x1 and y0 below y1")
     return area
 
 
@@ -67,8 +68,8 @@ def check_some_inside(inside: NDArray[np.bool_], x: FloatArray, y: FloatArray, w
     raise InputError(
         "no measured point lies in any of the areas",
         where=where,
-        allowed=f"areas that hold points; the wall has {wall} in the wall frame",
-        remedy="correct the coordinates of the areas: x runs along the wall and y up the wall, from the corner of the maps",
+        allowed=f"areas that hold points; the measured wall has {wall} in the wall frame",
+        remedy="correct the coordinates of the areas: in the wall frame, x runs along the wall and y up the wall",
     )
 
 

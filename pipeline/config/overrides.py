@@ -88,10 +88,10 @@ def read_with_overrides(
     try:
         return read(overrides)
     except InputError as error:
-        given = [each for each in overrides if isinstance(each, str)]
-        if not given or error.where.startswith("--set ") or is_wrong([each for each in overrides if not isinstance(each, str)]):
+        given, fixed = ([each for each in overrides if isinstance(each, str) is text] for text in (True, False))
+        if not given or error.where.startswith("--set ") or is_wrong(fixed):
             raise
-        options = ", ".join(f"--set {each}" for each in [each for each in given if is_wrong([each])] or given)
+        options = ", ".join(f"--set {each}" for each in [each for each in given if is_wrong([*fixed, each])] or given)
         where = error.where.replace(file, options) if file in error.where else f"{options}: {error.where}"
         raise InputError(error.what, where=where, allowed=error.allowed, remedy=error.remedy) from None
 

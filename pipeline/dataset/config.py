@@ -11,7 +11,7 @@ from pydantic import Field, StringConstraints, ValidationError, field_validator,
 from pipeline.change.annotate import AnnotationConfig
 from pipeline.change.tiles import TileConfig
 from pipeline.config.bundled import bundled_config
-from pipeline.config.overrides import Override, apply_overrides, read_with_overrides
+from pipeline.config.overrides import Override, apply_overrides, read_override, read_with_overrides
 from pipeline.config.presets import is_path, model_file
 from pipeline.config.simulation import SensorModel, SensorName, SimulationConfig, load_config
 from scene.blocks.block import RockfallConfig
@@ -298,7 +298,10 @@ def _wall(values: Any, where: str, folder: Path) -> Any:
             remedy="see configs/datasets/small.yaml for an example",
         )
     path = folder / site if is_path(site) else bundled_config("sites", site)
-    return load_config(path, [str(item) for item in overrides], None, None).model_dump(mode="json")
+    try:
+        return load_config(path, [read_override(str(item)) for item in overrides], None, None).model_dump(mode="json")
+    except InputError as error:
+        raise InputError(error.what, where=f"{where}: {error.where}", allowed=error.allowed, remedy=error.remedy) from None
 
 
 def _with_models(level: Any, folder: Path) -> Any:

@@ -40,7 +40,7 @@ def test_where_far_points_lie_says_whose_they_are(uneven: bool) -> None:
     assert found.uniform is not uneven
     assert found.share == pytest.approx(0.03 * 0.689, rel=0.15)
     assert ("all over the wall" in found.note) is not uneven
-    assert f"{100 * found.share:.2g} % of the points lie beyond 4 predicted standard deviations" in found.note
+    assert f"{100 * found.share:.2g} % of the points lie beyond 4 standard deviations" in found.note
 
 
 @pytest.mark.parametrize(("named", "base"), [(False, 0.002), (True, 0.001)])

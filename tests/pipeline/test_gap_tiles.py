@@ -79,6 +79,16 @@ def test_no_unequal_tiles_are_found_without_seams_or_at_one_edge() -> None:
         assert find_unequal_tiles(part, part.value + fault) is None
 
 
+def test_jumps_along_one_axis_alone_are_no_tiles() -> None:
+    """Locked disparities of a plane jump at columns; a strip within one row of tiles has seams along one axis only."""
+    for seed in range(10):
+        part = residuals(seed, 0.0, 160.0)
+        assert find_unequal_tiles(part, part.value + 0.2 * (part.geometry.u / 160.0 % 1.0)) is None
+    tiles = _with_unequal_tiles(5, 0.6, 230.0)
+    strip = tiles.part(np.flatnonzero((tiles.geometry.v > 700.0) & (tiles.geometry.v < 915.0)))
+    assert find_unequal_tiles(strip, strip.value) is None
+
+
 def test_tiles_of_the_detectable_shift_are_found_in_95_of_100_measurements() -> None:
     """On average 57 of 60 measurements show the tiles. By chance fewer than 51 do in 0.1 % of trials, and all in 5 %."""
     quiet = residuals(0, 0.0, 230.0)

@@ -199,7 +199,7 @@ def select_effects(given: SelectionInput) -> tuple[list[NamedEffect], SelectionR
         before = frozenset(each.candidate.name for each in found.estimates)
         return keep_implausible_in_class(again, found.chosen, before, wrong), result
     systematic = [effect_from_estimate(each, found.residuals) for each in found.estimates]
-    result = _result(given, search, first, found, noise, left, frozenset(item.name for item in systematic))
+    result = _result(given, search, first, found, noise, left, frozenset(item.name for item in systematic), apart.locking)
     angles = [each for each in systematic if each.effect is AngleEmpirical]
     if angles and not model_has(measurement, AngleEmpirical.tag()):
         return _select_beside_angle_terms(given, angles, result)
@@ -326,10 +326,14 @@ def _result(
     noise: _FittedNoise,
     left: FloatArray,
     systematic: frozenset[str],
+    locking: Locking | None,
 ) -> SelectionResult:
-    """Return the scores and tests of a selection; left: (n,) residuals after its systematic effects; systematic: their names."""
+    """Return the scores and tests of a selection.
+
+    left: (n,) residuals after its systematic effects; systematic: their names; locking: the pixel locking that was found.
+    """
     design, sensor = found.search.design, given.part.sensor
-    tiles = _unequal_tiles(given, found, left)
+    tiles = _unequal_tiles(given, locking, found, left)
     alone = first.score_families(()) if found.estimates else ()
     names, cosines, survival = first.design.identifiability()
     tried = found.chosen[0].family_scores if found.chosen else found.tried
@@ -337,8 +341,8 @@ def _result(
         tried=tuple(item for item in tried if not item.name.startswith(SPATIAL_NULL)),
         variance_tried=tuple(noise.tried),
         systematic=systematic,
-        p_value=_at_most(found.p_value, tiles),
-        p_without_effects=_at_most(first.goodness_of_fit_p_value(alone) if alone else found.p_value, tiles),
+        p_value=_smaller_p_value(found.p_value, tiles),
+        p_without_effects=_smaller_p_value(first.goodness_of_fit_p_value(alone) if alone else found.p_value, tiles),
         unexplained_noise=(
             NoiseRatio(1.0, False) if noise.terms else NoiseRatio.of(found.residuals, design.cells, left, given.random)
         ),
@@ -355,21 +359,22 @@ def _result(
         },
         reference_sigma=design.reference_sigma([each.candidate for each in found.further]),
         detectable=lambda: _detectable_sizes(found, [each.effect for each in noise.terms], left, given.random),
-        p_value_beside=cache(lambda kept: _at_most(_p_value_beside(search, found, kept), tiles)),
+        p_value_beside=cache(lambda kept: _smaller_p_value(_p_value_beside(search, found, kept), tiles)),
     )
 
 
-def _unequal_tiles(given: SelectionInput, found: SearchOutcome, left: FloatArray) -> UnequalTiles | None:
-    """Tiles of the image that are shifted by unequal amounts, where no other effect of the catalogue makes jumps.
+def _unequal_tiles(given: SelectionInput, locking: Locking | None, found: SearchOutcome, left: FloatArray) -> UnequalTiles | None:
+    """Find tiles of the image that are shifted by unequal amounts.
 
-    Rounding and locking of disparities make jumps too. left: (n,) residuals after the systematic effects.
+    They are not searched for where the model has, or this selection found, pixel locking or shifted tiles, because these make
+    jumps too. left: (n,) residuals after the systematic effects.
     """
-    known = any(model_has(given.measurement, effect.tag()) for effect in (TileShift, PixelLocking))
-    stereo = found.residuals if isinstance(found.residuals, StereoResiduals) else None
-    return None if stereo is None or known else find_unequal_tiles(stereo, left)
+    if locking is not None or any(model_has(given.measurement, effect.tag()) for effect in (TileShift, PixelLocking)):
+        return None
+    return find_unequal_tiles(found.residuals, left) if isinstance(found.residuals, StereoResiduals) else None
 
 
-def _at_most(p_value: float | None, tiles: UnequalTiles | None) -> float | None:
+def _smaller_p_value(p_value: float | None, tiles: UnequalTiles | None) -> float | None:
     """The p-value of a misfit, or that of shifted tiles if it is smaller."""
     return p_value if tiles is None else min(1.0 if p_value is None else p_value, tiles.p_value)
 

@@ -114,6 +114,7 @@ def fit_jointly(
     given : points, residuals and candidate effects.
     candidates : the effects to fit, as regression terms.
     least_decrease : relative decrease of the mean squared residual, in units of the predicted variance, below which the fit ends.
+        A step that increases it is dropped, except the first one, because the linearised start may be far off.
 
     Returns
     -------
@@ -123,16 +124,16 @@ def fit_jointly(
 
     None instead if an effect is out of bounds or too few points remain.
     """
-    found, before = _JointFit.nothing_of(given, candidates), np.inf
-    for _ in range(_MOST_FITS):
-        step = found.improved(given)
+    found = _JointFit.start(given, candidates)
+    for number in range(_MOST_FITS):
+        step = found.stepped(given)
         if step is None:
             return None
-        after = step.mean_square
-        if after > before:
+        before, after = found.mean_square_beside(step), step.mean_square_beside(found)
+        if number and after > before:
             break
-        found, converged, before = step, after > (1 - least_decrease) * before, after
-        if converged:
+        found = step
+        if number and after > (1 - least_decrease) * before:
             break
     return found.measurement, found.residuals, np.asarray(_all_columns(found.candidates) @ found.values)
 
@@ -151,16 +152,16 @@ class _JointFit:
     values: FloatArray
 
     @classmethod
-    def nothing_of(cls, given: SearchInput, candidates: list[Candidate]) -> _JointFit:
+    def start(cls, given: SearchInput, candidates: list[Candidate]) -> _JointFit:
         """Start with effects of size zero."""
         return cls(given.measurement, given.part, candidates, np.zeros(sum(each.columns.shape[1] for each in candidates)))
 
-    @property
-    def mean_square(self) -> float:
-        """Mean squared residual, in units of the predicted variance."""
-        return float(np.mean((self.residuals.value / self.residuals.sigma) ** 2))
+    def mean_square_beside(self, other: _JointFit) -> float:
+        """Mean squared residual, in units of the predicted variance, of the points that meet the reference in both fits."""
+        common = still_present(other.residuals, self.residuals)
+        return float(np.mean((self.residuals.value / self.residuals.sigma)[common] ** 2))
 
-    def improved(self, given: SearchInput) -> _JointFit | None:
+    def stepped(self, given: SearchInput) -> _JointFit | None:
         """Change the sizes by a Gauss-Newton step; None if an effect is then out of bounds, or too few points remain."""
         at, widths = self.residuals, [each.columns.shape[1] for each in self.candidates]
         precision = np.concatenate([prior_precision(each, width) for each, width in zip(self.candidates, widths, strict=True)])

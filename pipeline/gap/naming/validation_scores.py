@@ -91,7 +91,8 @@ def validate_effects(
     -------
     ValidatedEffects : accepted effects; failed ones, which do not improve the likelihood; and weak ones, which improve it, but
         too little to be named beside others: by no more than `variance.least_gain`, in too few wall blocks (`verdict.block_p`),
-        the effect's size is within its uncertainty of zero, or an empirical term may only describe what is inexact of another.
+        the effect's size is within its uncertainty of zero, or an empirical term gains less than the share `mean.class_share` of
+        what the strongest effect gains.
     """
     scorable = [item for item in named if item.effect.scored()]
     if not scorable or (~training).sum() < 100:
@@ -120,7 +121,7 @@ def validate_effects(
     kept = [item for item in named if item not in failed]
     measured = [replace(item, gain=total.get(id(item), item.gain)) for item in kept]
     gains_in_blocks = [found.get(id(item)) for item in kept]
-    most = max((item.gain for item in measured if item.kind == "physical"), default=0.0)
+    most = max((total[id(item)] for item in kept if item in strongest_first and item.kind == "physical"), default=0.0)
     weak = [each for each, own in zip(measured, gains_in_blocks, strict=True) if len(kept) > 1 and _is_weak(each, own, most)]
     return ValidatedEffects([item for item in measured if item not in weak], failed, weak)
 
@@ -167,13 +168,15 @@ def describe_weakness(item: NamedEffect) -> str:
     item: an effect whose size is consistent with zero, whose log-likelihood ratio on validation blocks is too small, or on which
         these blocks do not agree; or an empirical term that gains next to nothing beside another effect.
     """
+    gain = f"{item.gain:.1f} in log-likelihood on validation blocks"
     if item.kind != "physical":
-        return f"it gains only {item.gain:.1f} in log-likelihood on validation blocks, as little as another effect may be inexact"
+        share = f"{100 * thresholds().mean.class_share:g} %"
+        return f"it gains only {gain}, less than {share} of what the strongest effect gains, whose form may be inexact by so much"
     if _is_consistent_with_zero(item):
         return "its value is within its uncertainty of zero"
     if item.gain <= thresholds().variance.least_gain:
-        return f"it gains only {item.gain:.1f} in log-likelihood on validation blocks"
-    return f"it gains {item.gain:.1f} in log-likelihood on validation blocks, but most of that in few blocks"
+        return f"it gains only {gain}"
+    return f"it gains {gain}, but these blocks do not agree: their gains could be chance"
 
 
 def _is_consistent_with_zero(item: NamedEffect) -> bool:

@@ -22,9 +22,9 @@ class HeavyTails:
     Attributes
     ----------
     share : share of all residuals beyond `limit_sigmas`.
-    limit_sigmas : number of predicted standard deviations beyond which a residual is an outlier.
-    sigma : standard deviation of the noise to be added to the predicted noise to explain the scatter of all residuals, in
-        predicted standard deviations.
+    limit_sigmas : number of standard deviations of the core beyond which a residual is an outlier.
+    sigma : standard deviation of the noise to be added to that of the core to explain the scatter of all residuals, in
+        standard deviations of the core.
     gain : log-likelihood ratio of a mixture, in which this share of the residuals has larger noise, against normal noise.
     uniform : whether outliers lie all over the wall, as an instrument's own do. Edges, plants and moved rock leave them in
         parts of it.
@@ -40,7 +40,7 @@ class HeavyTails:
     def note(self) -> str:
         """Description of the excess outliers of the residuals, as a sentence for the report."""
         where = "all over the wall" if self.uniform else "in parts of the wall, as at edges, plants or moved rock"
-        return f"{100 * self.share:.2g} % of the points lie beyond {self.limit_sigmas:g} predicted standard deviations, {where}"
+        return f"{100 * self.share:.2g} % of the points lie beyond {self.limit_sigmas:g} standard deviations, {where}"
 
 
 def find_heavy_tails(z: FloatArray, block: NDArray[np.int64]) -> HeavyTails | None:
@@ -48,7 +48,8 @@ def find_heavy_tails(z: FloatArray, block: NDArray[np.int64]) -> HeavyTails | No
 
     Parameters
     ----------
-    z : (n,) residuals over the standard deviation that the model with all named effects predicts.
+    z : (n,) residuals over the standard deviation of their core: the one that the model with all named effects predicts, times
+        the ratio of observed to predicted noise.
     block : (n,) number of the wall block (a square part of the wall) of each point, to see whether outliers lie all over the
         wall.
     """

@@ -31,7 +31,11 @@ _CLIP_SIGMAS = 4.0
 """Standard deviations at which differences are clipped, because of depth steps."""
 _AT_ONCE, _REFINED = 512, 201
 """Sides that are tried together, and sides that are tried around the best one."""
-_FEWEST_SEAMS, _EVERY = 3, 2
+_LEAST_PATTERN_SHARE = 0.5
+"""Least share of the variance of the jumps that a checkerboard explains, if it is named."""
+_LEAST_AXIS_SIGMAS = 2.5
+"""Least standardised score of the seams of either axis, so that jumps along one axis alone are no tiles."""
+_FEWEST_SEAMS, _SIDE_STRIDE = 3, 2
 """Fewest seams by which tiles with unequal shifts are told from a single edge on the wall; such tiles are tried with every second
 side, which moves the last seam by half a cell."""
 
@@ -123,7 +127,7 @@ def find_tile_seams(residuals: StereoResiduals, registered_residuals: FloatArray
     """Find image tiles that a stereo matcher processed separately and shifted against each other, like a checkerboard.
 
     The test compares the disparities of neighbouring points on both sides of possible seams. Tiles with unequal shifts agree with
-    some checkerboard by chance, which explains a small share of the jumps at their seams (`verdict.least_closed`).
+    some checkerboard by chance, which explains a small share of the jumps at their seams.
 
     Parameters
     ----------
@@ -149,7 +153,7 @@ def find_tile_seams(residuals: StereoResiduals, registered_residuals: FloatArray
     sigmas, information = float(found.sigmas[found.best]), float(found.information[found.best])
     near = found.sides[np.abs(found.sigmas) > abs(sigmas) - 1]
     amplitude, unequal = float(found.total[found.best]) / information, find_unequal_tiles(residuals, registered_residuals)
-    if unequal is not None and (2 * amplitude) ** 2 < thresholds().verdict.least_closed * unequal.jump_px**2:
+    if unequal is not None and (2 * amplitude) ** 2 < _LEAST_PATTERN_SHARE * unequal.jump_px**2:
         return None
     return TileSeams(
         float(near.mean()),
@@ -190,9 +194,11 @@ class UnequalTiles:
 def find_unequal_tiles(residuals: StereoResiduals, value: FloatArray) -> UnequalTiles | None:
     """Find image tiles that a stereo matcher shifted by unequal amounts, against each other.
 
-    Between each two neighbouring columns of the raster, the jump of each row of tiles is estimated by the mean difference, and
-    the squares are averaged. If tiles are shifted, the columns at their seams rank high among all columns, and so do rows. The
-    normal scores of the ranks (van der Waerden) are summed over the seams. A single edge on the wall therefore counts little.
+    Between each two neighbouring columns of the raster, each row of tiles has a mean difference, its jump. The square of each
+    jump, times the number of its differences, is averaged; without tiles it has the same expectation in every column. If tiles
+    are shifted, the columns at their seams rank high among all columns, and so do rows. The normal scores of the ranks (van der
+    Waerden) are summed over the seams. A single edge on the wall therefore counts little. Both axes must have seams that rank
+    high, because locked or rounded disparities jump along one axis only.
 
     Parameters
     ----------
@@ -210,12 +216,13 @@ def find_unequal_tiles(residuals: StereoResiduals, value: FloatArray) -> Unequal
         _AxisJumps.of(test.u, test.v, test.across.value, test.across.known),
         _AxisJumps.of(test.v, test.u, test.down.value.T, test.down.known.T),
     )
-    sides = test.sides[::_EVERY]
+    sides = test.sides[::_SIDE_STRIDE]
     scores = np.array([_seam_score(axes, side) for side in sides])
     side, p_value = float(sides[np.argmax(scores)]), float(len(scores) * norm.sf(scores.max()))
     if p_value > thresholds().locking.significance:
         return None
-    return UnequalTiles(side, float(np.sqrt(np.mean([each.jump_variance(side) for each in axes]))), p_value)
+    jumps = np.concatenate([each.squared_jumps(side) for each in axes])
+    return UnequalTiles(side, float(np.sqrt(max(float(jumps.mean()), 0.0))), p_value)
 
 
 def detectable_tile_shift(residuals: StereoResiduals, registered_residuals: FloatArray) -> DetectableSize:
@@ -286,8 +293,12 @@ class _TileTrials:
 class _AxisJumps:
     """Sums of the differences of neighbouring cells along one axis of the raster, for the jumps between whole tiles.
 
-    along: (c,) coordinates of the cells along the axis, px; beside: (r,) those across it; sums, counts: (r + 1, c - 1) sums of
-    the differences over the cells across the axis before each, and the numbers of those that are known.
+    Attributes
+    ----------
+    along : (c,) coordinates of the cells along the axis, px.
+    beside : (r,) coordinates of the cells across the axis, px.
+    sums : (r + 1, c - 1) cumulative sums across the axis: row k is the sum of the differences of the first k rows of cells, px.
+    counts : (r + 1, c - 1) the same for the numbers of known differences.
     """
 
     along: FloatArray
@@ -324,21 +335,22 @@ class _AxisJumps:
         rank[known] = rankdata(square[known] / rows[known])
         return ndtri((rank[seams][known[seams]] - 0.5) / known.sum())
 
-    def jump_variance(self, side: float) -> float:
-        """Variance of the jumps at the seams beyond that elsewhere, px²."""
+    def squared_jumps(self, side: float) -> FloatArray:
+        """Squares of the jumps at the seams, px², each minus what noise contributes to it."""
         sums, counts, seams = self.jumps(side)
         at_seam = np.zeros(sums.shape[1], dtype=bool)
         at_seam[seams] = True
         known, many = counts > 0, np.maximum(counts, 1)
         noise = float(np.mean((sums**2 / many)[known & ~at_seam]))
-        jump = ((sums**2 / many - noise) / many)[known & at_seam]
-        return max(float(jump.mean()), 0.0)
+        return np.asarray(((sums**2 / many - noise) / many)[known & at_seam])
 
 
 def _seam_score(axes: tuple[_AxisJumps, _AxisJumps], side: float) -> float:
-    """Sum of the normal scores of all seams, standardised; 0 if there are too few seams."""
-    scores = np.concatenate([each.seam_scores(side) for each in axes])
-    return float(scores.sum() / np.sqrt(len(scores))) if len(scores) >= _FEWEST_SEAMS else 0.0
+    """Sum of the normal scores of all seams, standardised; 0 if there are too few, or if those of one axis do not rank high."""
+    of_axes = [each.seam_scores(side) for each in axes]
+    scores = np.concatenate(of_axes)
+    enough = len(scores) >= _FEWEST_SEAMS and all(each.sum() > _LEAST_AXIS_SIGMAS * np.sqrt(len(each)) for each in of_axes)
+    return float(scores.sum() / np.sqrt(len(scores))) if enough else 0.0
 
 
 def _axis(x: FloatArray, step: float) -> tuple[FloatArray, NDArray[np.int64]]:
