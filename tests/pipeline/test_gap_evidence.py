@@ -332,3 +332,14 @@ def test_a_weak_effect_is_named_if_a_misfit_is_left_only_without_it(
     selection: Any = SimpleNamespace(systematic=names, p_value_given=lambda named: with_it if weak in named else without)
     found = ValidatedEffects([strong], [], [weak]).with_needed(selection)
     assert found == (ValidatedEffects([strong, weak], [], []) if stays else ValidatedEffects([strong], [], [weak]))
+
+
+def test_a_weak_curve_is_not_named_although_it_explains_a_misfit() -> None:
+    """A curve names no cause, and the inexact form of the strong effect may be all that it describes."""
+    strong = NamedEffect("tls.a", "physical", {"name": "a"}, {}, (), 0.002, 9.0)
+    curve = replace(strong, name="tls.b", kind="empirical")
+    selection: Any = SimpleNamespace(
+        systematic=frozenset({"tls.a", "tls.b"}), p_value_given=lambda named: 0.2 if curve in named else 0.002
+    )
+    found = ValidatedEffects([strong], [], [curve])
+    assert found.with_needed(selection) == found

@@ -459,6 +459,11 @@ def test_a_curve_beside_an_effect_that_gains_a_hundred_times_as_much_is_only_men
     assert [item.name for item in scored.named] == ["tls.range_incidence_bias", "tls.range_empirical"][: 1 + named]
     assert [item.name for item in scored.weak] == ["tls.range_empirical"][: not named]
     assert all("less than 1 % of what the strongest effect gains" in describe_weakness(item) for item in scored.weak)
+    limit = NamedEffect("tls.detection_limit", "physical", {"name": "detection_limit", "minimum_power": 1e-9}, {}, (), None, 1e6)
+    beside_losses = validate_effects(
+        there, residuals, [effects[1], limit], ~blocks.for_validation(residuals.wall_xy), 0.0004, blocks
+    )
+    assert not beside_losses.weak, "lost returns move no point"
 
 
 def test_of_two_curves_with_one_name_only_the_wrong_one_fails(tmp_path: Path) -> None:

@@ -46,13 +46,13 @@ class ValidatedEffects:
     weak: list[NamedEffect]
 
     def with_needed(self, selection: SelectionResult) -> ValidatedEffects:
-        """Return the same effects, with the weak systematic ones named if only they explain a misfit.
+        """Return the same effects, with the weak systematic ones of the catalogue named if only they explain a misfit.
 
         Without them the residuals must clearly disagree with the model (`verdict.rejection_p`), and with them no longer.
 
         selection: the selection that found the effects.
         """
-        needed = [item for item in self.weak if item.name in selection.systematic]
+        needed = [item for item in self.weak if item.name in selection.systematic and item.kind == "physical"]
         if not needed:
             return self
         with_them = [*self.named, *needed]
@@ -121,7 +121,8 @@ def validate_effects(
     kept = [item for item in named if item not in failed]
     measured = [replace(item, gain=total.get(id(item), item.gain)) for item in kept]
     gains_in_blocks = [found.get(id(item)) for item in kept]
-    most = max((total[id(item)] for item in kept if item in strongest_first and item.kind == "physical"), default=0.0)
+    of_form = [item for item in measured if item.kind == "physical" and item.effect.shows_in in (ShowsIn.MEAN, ShowsIn.EDGES)]
+    most = max((item.gain for item in of_form), default=0.0)
     weak = [each for each, own in zip(measured, gains_in_blocks, strict=True) if len(kept) > 1 and _is_weak(each, own, most)]
     return ValidatedEffects([item for item in measured if item not in weak], failed, weak)
 
@@ -139,7 +140,8 @@ def _is_weak(item: NamedEffect, gains: FloatArray | None, most: float) -> bool:
     """Whether an effect beside others gains too little, or in too few wall blocks, to be named, or may be of size zero.
 
     An empirical term must gain more than the inexact part (`mean.class_share`) of the effect of the catalogue that gains most,
-    because it may describe no more than that. most: what that effect gains.
+    because it may describe no more than that. most: what that effect gains. Noise and lost returns do not count: they move no
+    point, so their form cannot be mistaken for a curve.
     """
     if gains is None:
         return False
