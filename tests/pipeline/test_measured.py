@@ -72,7 +72,7 @@ def test_a_folder_of_maps_and_a_folder_of_points(tmp_path: Path) -> None:
         "reference": "wall.ply",
         "points": ["scan_0.ply", "scan_1.ply"],
         "scanner": {"position_m": [0.0, 0.0, 20.0], "rotation": rotation},
-        "stable_areas": [[0, 0, 1, 1]],
+        "stable_areas": [[2, 2, 3, 3]],
         "model": "model.yaml",
     }
     (folder / "measurement.yaml").write_text(yaml.safe_dump(values))
