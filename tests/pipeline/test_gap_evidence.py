@@ -160,7 +160,7 @@ def test_noise_of_some_scan_lines_gets_no_name(tmp_path: Path, cycle: int) -> No
     (found,), _, note = fit_variance_model(part, WallCells.over(part.wall_xy), value, KeyedRandom(1))
     assert found.effect == "range_noise"
     assert found.empirical == (cycle > 1)
-    assert note == ("the noise varies with line as no effect of the catalogue does" if cycle > 1 else "")
+    assert note == ("the noise varies with line, which no effect of the catalogue explains" if cycle > 1 else "")
 
 
 def test_what_a_free_form_misses_of_a_drift_gets_no_name(tmp_path: Path) -> None:
@@ -335,7 +335,7 @@ def test_a_weak_effect_is_named_if_a_misfit_is_left_only_without_it(
 
 
 def test_a_weak_curve_is_not_named_although_it_explains_a_misfit() -> None:
-    """A curve names no cause, and the inexact form of the strong effect may be all that it describes."""
+    """A curve names no cause, and may describe no more than what is inexact in the form of the strong effect."""
     strong = NamedEffect("tls.a", "physical", {"name": "a"}, {}, (), 0.002, 9.0)
     curve = replace(strong, name="tls.b", kind="empirical")
     selection: Any = SimpleNamespace(

@@ -187,7 +187,7 @@ def fit_variance_model(
         return seen.terms(chosen, pairs, p_value), tried, ""
     if free.score - chosen.score > by.nonparametric_share * chosen.gain:
         named = [replace(each, empirical=True) for each in seen.terms(best, pairs, p_value)]
-        return named, tried, f"the noise varies with {free.name} as no effect of the catalogue does"
+        return named, tried, f"the noise varies with {free.name}, which no effect of the catalogue explains"
     note = f"the noise also varies with {free.name}, which no effect of the catalogue explains"
     return seen.terms(chosen, pairs, p_value), tried, note
 
