@@ -133,6 +133,15 @@ def test_each_of_several_effects_says_what_it_takes_away(few: tuple[GapDiagnosis
     assert contributions(replace(found, effects=()), measurement).shape == (0, len(found.before))
 
 
+@pytest.mark.parametrize(("verdict", "told"), [("unknown", True), ("no_gap", True), ("named", False)])
+def test_the_terminal_shows_remarks_where_no_name_explains(
+    few: tuple[GapDiagnosis, Measurement], verdict: str, told: bool
+) -> None:
+    """Remarks say what an answer without a name found, such as seams of tiles; a named effect speaks for itself."""
+    found = replace(few[0], verdict=verdict, remaining={**few[0].remaining, "note": "the disparities jump"})
+    assert ("  note: the disparities jump" in report.summarise(found).splitlines()) is told
+
+
 def test_nothing_is_written_where_the_report_cannot_be_made(
     few: tuple[GapDiagnosis, Measurement], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

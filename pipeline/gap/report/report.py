@@ -148,7 +148,7 @@ def _summary(found: GapDiagnosis) -> str:
         lines.append(f"  gap {scores}: {describe_closing(found.gap, found.model_changed)}")
     lines += [f"  {line}"] if (line := unseen_line(found)) else []
     lines += [f"  {line}"] if (line := reference_line(found)) else []
-    if found.verdict == "no_gap" and found.remaining.get("note"):
+    if found.verdict in ("no_gap", "unknown") and found.remaining.get("note"):
         lines.append(f"  note: {found.remaining['note']}")
     return "\n".join(lines)
 
