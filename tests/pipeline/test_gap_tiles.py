@@ -80,7 +80,7 @@ def test_no_unequal_tiles_are_found_without_seams_or_at_one_edge() -> None:
 
 
 def test_jumps_along_one_axis_alone_are_no_tiles() -> None:
-    """Locked disparities of a plane jump at columns; a strip within one row of tiles has seams along one axis only."""
+    """Pixel locking on a tilted plane makes jumps between columns only; a strip within one row of tiles has no other seams."""
     for seed in range(10):
         part = residuals(seed, 0.0, 160.0)
         assert find_unequal_tiles(part, part.value + 0.2 * (part.geometry.u / 160.0 % 1.0)) is None

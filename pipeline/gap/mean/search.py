@@ -330,7 +330,7 @@ class MeanSearch:
         return sorted(best.values(), key=lambda item: -item[0])
 
     def _ratios_alone(self) -> list[tuple[float, Candidate]]:
-        """Log-likelihood ratio of each variant of each error but sines, without other errors in the model."""
+        """Log-likelihood ratio of each variant (such as the camera) of each error that is no sine, alone in the model."""
         plain, fixed, _ = self._profile(())
         return list(zip(fixed[:, 0] - plain[0], self.design.families.plain, strict=True))
 

@@ -30,7 +30,7 @@ from pipeline.gap.thresholds import equivalence_margin, thresholds
 from scene.geometry.mesh import FloatArray
 
 _MOST_CONVERGED, _MOST_ROUNDS, _CONVERGED_GAIN = 3, 8, 1.0
-"""Most effects that are refitted to convergence, most iterations of each, and the gain of log-likelihood below which they end."""
+"""Number of effects that are refitted to convergence, largest number of iterations, and gain of log-likelihood that ends them."""
 _ABSORBED_SHARE = 0.5
 """The linearised model is inexact if its error exceeds this share of the log-likelihood ratio of any selected effect."""
 

@@ -326,7 +326,7 @@ class _AxisJumps:
         )
 
     def seam_scores(self, side: float) -> FloatArray:
-        """Normal scores of the mean squared jumps at the seams, among those between all neighbouring columns."""
+        """Normal score of each seam: from the rank of its mean squared jump among those of all neighbouring columns."""
         sums, counts, seams = self.jumps(side)
         square = np.divide(sums**2, counts, out=np.zeros_like(sums), where=counts > 0).sum(axis=0)
         rows = (counts > 0).sum(axis=0)
