@@ -5,7 +5,7 @@ Their normal equations are part of the design. Designs are immutable.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
@@ -243,7 +243,7 @@ class Design:
     def _with_sine(self, candidate: Candidate) -> Design:
         """Make a sine, with its period refined, a fixed column."""
         (found,) = self.fit_refined([candidate])[0]
-        added = self.model.project(_projected(self.pose_basis, self._matrix([found], None)))
+        added = self._split(found, None)
         had = [self.fixed] if self.sine_columns is None else [self.fixed, self.sine_columns]
         equations = extend(self.equations, had, self.value, added)
         start = sum(each.within.shape[1] for each in had)
@@ -271,7 +271,7 @@ class Design:
         value : (n,) the other residuals, in the unit of the observable (m, or px of disparity).
         candidates : The candidate errors.
         """
-        columns = self._projected_pose.append(self.model.project(_projected(self.pose_basis, self._matrix(candidates, None))))
+        columns = ProjectedColumns.concatenate([self._projected_pose, *(self._split(each, None) for each in candidates)])
         projected = self.model.project(value[self.model.rows, None] * self.model.inverse_sigma[:, None])
         return fit_reml(self.model.covariances, columns, projected).log_likelihood
 
@@ -297,8 +297,9 @@ class Design:
             known = np.asarray(turned.T @ (self.pose_precision[:, None] * turned), dtype=np.float64)
             found = fit_reml(self.model.covariances, self._projected_pose, self.value, known)
             return replace(found, coefficients=turned @ found.coefficients, covariance=turned @ found.covariance @ turned.T)
-        matrix = self._matrix(candidates, wave_coefficients)
-        columns = self._projected_pose.append(self.model.project(_projected(self.pose_basis, matrix)))
+        paired = list(zip(candidates, wave_coefficients or [None] * len(candidates), strict=True))
+        matrix = np.concatenate([self._over_sigma(*each) for each in paired], axis=1)
+        columns = ProjectedColumns.concatenate([self._projected_pose, *(self._split(*each) for each in paired)])
         # the fit uses orthonormal columns of the pose, projected out of the candidates; this matrix transforms back
         back = np.block(
             [
@@ -306,11 +307,7 @@ class Design:
                 [np.zeros((matrix.shape[1], len(turned))), np.eye(matrix.shape[1])],
             ]
         )
-        widths = [
-            candidate.columns.shape[1] + (coefficients is not None)
-            for candidate, coefficients in _with_wave_coefficients(candidates, wave_coefficients)
-        ]
-        typical = [prior_precision(each, width) for each, width in zip(candidates, widths, strict=True)]
+        typical = [prior_precision(each, each.columns.shape[1] + (present is not None)) for each, present in paired]
         precision = np.concatenate([self.pose_precision, *typical])
         found = fit_reml(self.model.covariances, columns, self.value, back.T @ (precision[:, None] * back))
         return replace(found, coefficients=back @ found.coefficients, covariance=back @ found.covariance @ back.T)
@@ -413,19 +410,16 @@ class Design:
             return [], np.zeros((0, 0)), np.zeros(0)
         whole = np.concatenate(matrices, axis=1)
         weight = self.equations.covariances[row].weight[:, None]
-        grams = []
-        for columns in (whole, left := _projected(self.pose_basis, whole)):
-            projected = self.model.project(columns)
-            between = projected.between[self.null_covariance.basis]
-            grams.append(projected.within.T @ projected.within_weighted + (between * weight).T @ between)
-        count = len(self.pose_columns)
-        matrix, pose = grams[1], self.equations.fixed[row][:count, :count]
-        found, base = self.model.project(left), self.fixed
-        cross = base.within[:, :count].T @ found.within_weighted
-        cross += base.between[self.null_covariance.basis][:, :count].T @ (weight * found.between[self.null_covariance.basis])
-        matrix = matrix - cross.T @ np.linalg.solve(pose, cross)
+        whole_split, found = (self.model.project(columns) for columns in (whole, _projected(self.pose_basis, whole)))
+        basis, count = self.null_covariance.basis, len(self.pose_columns)
+
+        def products(one: ProjectedColumns, other: ProjectedColumns) -> FloatArray:
+            return np.asarray(one.within.T @ other.within_weighted + one.between[basis].T @ (weight * other.between[basis]))
+
+        cross = products(self._projected_pose, found)
+        matrix = products(found, found) - cross.T @ np.linalg.solve(self.equations.fixed[row][:count, :count], cross)
         size = np.sqrt(np.maximum(np.diag(matrix), 0))
-        full = np.sqrt(np.maximum(np.diag(grams[0]), 1e-200))  # avoids dividing by a signature of 0
+        full = np.sqrt(np.maximum(np.diag(products(whole_split, whole_split)), 1e-200))  # avoids dividing by a signature of 0
         scale = np.maximum(size, 1e-12 * full)
         return names, np.clip(matrix / np.outer(scale, scale), -1, 1), size / full
 
@@ -434,19 +428,23 @@ class Design:
         """Projected columns of the pose."""
         return self.fixed.select(self.pose_columns)
 
-    def _matrix(self, candidates: list[Candidate], wave_coefficients: list[FloatArray | None] | None) -> FloatArray:
-        """Columns of some candidates over sigma, with a sine's derivative by its frequency if its coefficients are given."""
-        rows, root = self.model.rows, self.model.inverse_sigma[:, None]
-        matrices = []
-        for candidate, coefficients in _with_wave_coefficients(candidates, wave_coefficients):
-            wave = candidate.wave
-            columns = (
-                candidate.columns
-                if wave is None or coefficients is None
-                else wave.with_frequency_derivative(candidate.period, coefficients)
-            )
-            matrices.append(columns[rows] * root)
-        return np.concatenate(matrices, axis=1)
+    def _split(self, candidate: Candidate, wave_coefficients: FloatArray | None) -> ProjectedColumns:
+        """Split columns of a candidate, with the pose projected out. wave_coefficients: as for `_over_sigma`."""
+        if candidate.wave is None and candidate in self.column_numbers:
+            return self.fixed.select(self.column_numbers[candidate])
+        return self.model.project(_projected(self.pose_basis, self._over_sigma(candidate, wave_coefficients)))
+
+    def _over_sigma(self, candidate: Candidate, wave_coefficients: FloatArray | None) -> FloatArray:
+        """Columns of a candidate over sigma.
+
+        wave_coefficients: of a sine, its coefficients if its derivative by the frequency is wanted too; else None.
+        """
+        wave = candidate.wave
+        if wave is None or wave_coefficients is None:
+            columns = candidate.columns
+        else:
+            columns = wave.with_frequency_derivative(candidate.period, wave_coefficients)
+        return np.asarray(columns[self.model.rows] * self.model.inverse_sigma[:, None])
 
 
 def _columns(model: MeanModel, pose: FloatArray, plain: list[Candidate], place: Mapping[Candidate, list[int]]) -> FloatArray:
@@ -489,10 +487,3 @@ def _number_columns(plain: list[Candidate], start: int) -> dict[Candidate, list[
     for candidate in plain:
         place[candidate] = list(range(start, start := start + candidate.columns.shape[1]))
     return place
-
-
-def _with_wave_coefficients(
-    candidates: list[Candidate], wave_coefficients: list[FloatArray | None] | None
-) -> Iterator[tuple[Candidate, FloatArray | None]]:
-    """Pair candidates with the coefficients of their sines."""
-    return zip(candidates, wave_coefficients or [None] * len(candidates), strict=True)

@@ -453,10 +453,14 @@ def extend(
     """
     cross, own = np.concatenate([each.within.T @ added.within_weighted for each in had]), added.within.T @ added.within_weighted
     right = added.within.T @ value.within_weighted
-    fixed, sides = [], []
+    count = equations.fixed.shape[1]
+    fixed = np.empty((len(equations.covariances), count + len(own), count + len(own)))
+    sides = np.empty((*fixed.shape[:2], equations.right.shape[2]))
+    fixed[:, :count, :count], sides[:, :count] = equations.fixed, equations.right
     for row, each in enumerate(equations.covariances):
         weighted = added.between[each.basis] * each.weight[:, None]
         beside = cross + np.concatenate([part.between[each.basis].T @ weighted for part in had])
-        fixed.append(np.block([[equations.fixed[row], beside], [beside.T, own + added.between[each.basis].T @ weighted]]))
-        sides.append(np.concatenate([equations.right[row], right + weighted.T @ value.between[each.basis]]))
-    return replace(equations, fixed=np.stack(fixed), right=np.stack(sides))
+        fixed[row, :count, count:], fixed[row, count:, :count] = beside, beside.T
+        fixed[row, count:, count:] = own + added.between[each.basis].T @ weighted
+        sides[row, count:] = right + weighted.T @ value.between[each.basis]
+    return replace(equations, fixed=fixed, right=sides)

@@ -108,7 +108,7 @@ class WithinCellNoise:
         -------
         (q, k) columns a.
         """
-        return np.asarray(cho_solve((self.root, True), on_nodes)) if len(self.root) else on_nodes
+        return np.asarray(cho_solve((self.root, True), on_nodes, check_finite=False)) if len(self.root) else on_nodes
 
     def whiten(self, on_nodes: FloatArray) -> FloatArray:
         """Transform k columns b over the q nodes of the pixel grid to a = L^-1 b, so that a' a = b' K^-1 b.
@@ -123,7 +123,7 @@ class WithinCellNoise:
         -------
         (q, k) columns a.
         """
-        return np.asarray(solve_triangular(self.root, on_nodes, lower=True)) if len(self.root) else on_nodes
+        return np.asarray(solve_triangular(self.root, on_nodes, lower=True, check_finite=False)) if len(self.root) else on_nodes
 
     def draw(self, white: FloatArray, rows: slice, cell_sums: FloatArray, random: KeyedRandom) -> FloatArray:
         """Simulate noise that neighbouring points share, in a form that quickly gives its effect on any fitted coefficient.
