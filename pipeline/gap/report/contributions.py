@@ -22,15 +22,13 @@ def contributions(found: GapDiagnosis, measurement: Measurement) -> FloatArray:
 
     Parameters
     ----------
-    found : diagnosis with k named effects and n points.
+    found : diagnosis with k named effects (at least one) and n points.
     measurement : measurement that was diagnosed.
 
     Returns
     -------
     FloatArray : (k, n) parts in the unit of the observable (m or px); 0 where a ray misses the reference.
     """
-    if len(found.effects) < 2:
-        return np.array([found.before - found.after for _ in found.effects]).reshape(-1, len(found.before))
     there = with_scan_order(measurement) if isinstance(measurement, TlsMeasurement) else measurement
     there, registration_rows = there.part(found.residuals.index), np.flatnonzero(found.residuals.usable & ~found.held_out)
     return np.stack(
