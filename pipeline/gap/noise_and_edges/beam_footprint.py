@@ -8,14 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.formats.measurements.measurement import TlsMeasurement
-from pipeline.gap.noise_and_edges.edge_effects import (
-    EdgeEffect,
-    blocks_for_edges,
-    log_density,
-    maximise_gain,
-    std_from_blocks,
-    total_if_agreed,
-)
+from pipeline.gap.noise_and_edges.edge_effects import EdgeEffect, agreed_gain, block_std, edge_blocks, log_density, maximise_gain
 from pipeline.gap.residuals.residuals import BoolArray
 from pipeline.gap.residuals.scan_simulation import simulate_ranges, simulate_ranges_by_mode, systematic_part
 from pipeline.gap.residuals.tls_residuals import TlsResiduals
@@ -76,7 +69,7 @@ def find_footprint(
     rows = rows[np.abs(widest_shift) > sigma[rows]]
     if not len(rows):
         return []
-    block = blocks_for_edges(residuals.wall_xy)[rows]
+    block = edge_blocks(residuals.wall_xy)[rows]
     jittered = shift(rows, ("mean",), _equivalent_divergence(measurement.model))["mean"]
     without = [log_density(registered_residuals[rows], moved, sigma[rows]) for moved in (np.zeros_like(jittered), jittered)]
     null = np.logaddexp(*without) - np.log(2)  # the first holds at a step, the second on a curved slope
@@ -88,12 +81,12 @@ def find_footprint(
 
     best_divergence = {mode: maximise_gain(partial(gains, mode), _DIVERGENCES_RAD, ()) for mode in _MODES}
     mode = max(best_divergence, key=lambda each: float(gains(each, best_divergence[each]).sum()))
-    gain = total_if_agreed(gains(mode, best_divergence[mode]), block, thresholds().edges.least_block_sigmas)
+    gain = agreed_gain(gains(mode, best_divergence[mode]), block, thresholds().edges.least_block_sigmas)
     if gain is None:
         return []
     divergence = maximise_gain(partial(gains, mode), [best_divergence[mode]], _REFINEMENT_FACTORS)
-    block_std = std_from_blocks(partial(gains, mode), block, divergence)
-    std = {"divergence_rad": float(np.hypot(block_std, _PROFILE_UNCERTAINTY * divergence))}
+    from_blocks = block_std(partial(gains, mode), block, divergence)
+    std = {"divergence_rad": float(np.hypot(from_blocks, _PROFILE_UNCERTAINTY * divergence))}
     touched = np.abs(shift(np.arange(len(residuals)), (mode,), 1.5 * divergence)[mode]) > sigma
     return [EdgeEffect(BeamDivergence(divergence_rad=divergence, mode=mode), std, gain, touched)]
 

@@ -16,14 +16,7 @@ from numpy.typing import NDArray
 
 from pipeline.change.robust import nmad
 from pipeline.formats.measurements.measurement import Measurement, StereoMeasurement
-from pipeline.gap.noise_and_edges.edge_effects import (
-    EdgeEffect,
-    blocks_for_edges,
-    log_density,
-    maximise_gain,
-    std_from_blocks,
-    total_if_agreed,
-)
+from pipeline.gap.noise_and_edges.edge_effects import EdgeEffect, agreed_gain, block_std, edge_blocks, log_density, maximise_gain
 from pipeline.gap.noise_and_edges.missing_returns import bernoulli_log_likelihood
 from pipeline.gap.residuals.alignment import AlignedMeasurement, RobustPoseFit, align, compute_residuals, fit_pose_robustly
 from pipeline.gap.residuals.disparity_raster import DisparityRaster
@@ -35,7 +28,6 @@ from scene.geometry.mesh import FloatArray
 from sensors.effects.base import Effect
 from sensors.effects.edge_fattening import EdgeFattening
 from sensors.effects.occlusion_fill import OcclusionFill
-from sensors.effects.raster_effect import RasterEffect
 from sensors.effects.smoothing import Smoothing
 
 _TRIED = 50_000
@@ -77,7 +69,7 @@ class _EdgeData:
     registered_residuals : (n,) residuals after a robust pose fit, px.
     sigma : (n,) their standard deviations, px.
     held_out : (n,) points that must not be used.
-    beside : known edge effects.
+    beside : known effects, of which the edge effects count.
     """
 
     residuals: StereoResiduals
@@ -98,7 +90,7 @@ class _EdgeData:
     ) -> _EdgeData:
         """Gather what a search needs; of a large raster only a part of the points is kept."""
         scale = nmad((registered_residuals / residuals.sigma)[residuals.usable], 0.0)
-        known: list[Effect] = [effect for effect in measurement.model.effects if isinstance(effect, RasterEffect)]
+        known: list[Effect] = [*measurement.model.effects]
         known_shift = raster.added_by(known, residuals.geometry.disparity)
         search_raster, points = raster.search_part()
         part = residuals.part(points)
@@ -121,17 +113,12 @@ class _EdgeData:
     @cached_property
     def block(self) -> NDArray[np.int64]:
         """(n,) number of each point's wall block; wall blocks must agree on an effect."""
-        return blocks_for_edges(self.residuals.wall_xy)
+        return edge_blocks(self.residuals.wall_xy)
 
     @cached_property
     def shift_without(self) -> FloatArray:
         """(n,) change of the disparities by the known effects alone, px."""
         return self.shift([])
-
-    @cached_property
-    def density(self) -> FloatArray:
-        """(n,) log density of the residuals with the known effects alone."""
-        return log_density(self.registered_residuals, self.shift_without, self.sigma)
 
     @cached_property
     def _pose_fit(self) -> RobustPoseFit:
@@ -146,7 +133,8 @@ class _EdgeData:
         shift = self.shift([effect])
         rows = np.flatnonzero((shift != self.shift_without) & ~self.held_out)
         gains = np.zeros(len(shift))
-        gains[rows] = log_density(self.registered_residuals[rows], shift[rows], self.sigma[rows]) - self.density[rows]
+        value, sigma = self.registered_residuals[rows], self.sigma[rows]
+        gains[rows] = log_density(value, shift[rows], sigma) - log_density(value, self.shift_without[rows], sigma)
         return gains
 
     def _registered(self, effects: list[Effect]) -> tuple[FloatArray, FloatArray, FloatArray]:
@@ -240,8 +228,8 @@ def _search(data: _EdgeData) -> list[EdgeEffect]:
         Smoothing.tag(): _find_smoothing,
         OcclusionFill.tag(): _find_filling,
     }
-    for name in {effect.name for effect in data.beside}:
-        del searches[name]
+    for effect in data.beside:
+        searches.pop(effect.name, None)
     while searches:
         current = replace(data, beside=[*data.beside, *(each.effect for each in found)])
         untouched = replace(current, held_out=np.any([data.held_out, *(each.touched for each in found)], axis=0))
@@ -361,17 +349,15 @@ def _find_fattening(data: _EdgeData) -> EdgeEffect | None:
     """
     best = most_likely_fattening(data.for_trials())
 
-    def of_radius(cells: float) -> EdgeFattening:
-        return best.model_copy(update={"radius_px": (cells + _ROUNDED_CELLS[0]) * data.raster.step})
-
     def gains(cells: float) -> FloatArray:
-        return data.clear_gains(of_radius(cells)) if cells >= 1 else np.zeros(len(data.residuals))
+        trial = best.model_copy(update={"radius_px": (cells + _ROUNDED_CELLS[0]) * data.raster.step})
+        return data.clear_gains(trial) if cells >= 1 else np.zeros(len(data.residuals))
 
     radius = float(int(best.radius_px / data.raster.step))
-    gain = total_if_agreed(gains(radius), data.block, by_signs=True)  # depth steps may occur in few places only
+    gain = agreed_gain(gains(radius), data.block, by_signs=True)  # depth steps may occur in few places only
     if gain is None:
         return None
-    radius_error = min(std_from_blocks(gains, data.block, radius, 1.0), radius)
+    radius_error = min(block_std(gains, data.block, radius, 1.0), radius)
     std = {"radius_px": data.raster.step * float(np.hypot(_ROUNDED_CELLS[1], radius_error))}
     return data.edge_effect(best, std, gain)
 
@@ -428,16 +414,16 @@ def _find_smoothing(data: _EdgeData) -> EdgeEffect | None:
         return at.gains(Smoothing(sigma_px=sigma))
 
     sigma = maximise_gain(partial(gains, at=few), [step * each for each in _SIGMAS], _REFINEMENT_FACTORS)
-    if total_if_agreed(gains(sigma, data), data.block) is None:
+    if agreed_gain(gains(sigma, data), data.block) is None:
         return None
     for _ in range(_REGISTRATIONS):  # the first registration and noise estimate absorb part of the low-pass
         few = few.registered_with(Smoothing(sigma_px=sigma))
         sigma = maximise_gain(partial(gains, at=few), [sigma], _REFINEMENT_FACTORS)
     data = data.registered_with(Smoothing(sigma_px=sigma))
-    gain = total_if_agreed(gains(sigma, data), data.block)
+    gain = agreed_gain(gains(sigma, data), data.block)
     if gain is None:
         return None
-    std = float(np.hypot(std_from_blocks(partial(gains, at=data), data.block, sigma), _SMOOTHING_UNCERTAINTY * sigma))
+    std = float(np.hypot(block_std(partial(gains, at=data), data.block, sigma), _SMOOTHING_UNCERTAINTY * sigma))
     return data.edge_effect(Smoothing(sigma_px=sigma), {"sigma_px": std}, gain)
 
 

@@ -45,7 +45,7 @@ class EdgeEffect:
         return self.effect.name
 
 
-def blocks_for_edges(at: FloatArray) -> NDArray[np.int64]:
+def edge_blocks(at: FloatArray) -> NDArray[np.int64]:
     """Divide the wall into squares (wall blocks) of about a hundred points, and return the number of that of each point (n,).
 
     Residuals are correlated within such a block, so blocks and not points count as independent in tests of edge effects.
@@ -55,7 +55,7 @@ def blocks_for_edges(at: FloatArray) -> NDArray[np.int64]:
     return wall_blocks_by_points(at, _POINTS_PER_BLOCK)
 
 
-def total_if_agreed(
+def agreed_gain(
     gains: FloatArray, block: NDArray[np.int64], least_sigmas: float | None = None, *, by_signs: bool = False
 ) -> float | None:
     """Test an edge effect: return its log-likelihood ratio if it is large enough and the wall blocks agree, else None.
@@ -63,7 +63,7 @@ def total_if_agreed(
     Parameters
     ----------
     gains : (n,) log-likelihood ratio of each point: model with the effect against model without it.
-    block : (n,) number of each point's wall block, from `blocks_for_edges`.
+    block : (n,) number of each point's wall block, from `edge_blocks`.
     least_sigmas : smallest `agreement` of the wall blocks that is accepted; None: the threshold `edges.block_sigmas`.
     by_signs : whether agreement of the signs alone is enough, for effects of which a few wall blocks hold most of the points.
     """
@@ -75,9 +75,7 @@ def total_if_agreed(
     return total
 
 
-def std_from_blocks(
-    gains: Callable[[float], FloatArray], block: NDArray[np.int64], value: float, width: float | None = None
-) -> float:
+def block_std(gains: Callable[[float], FloatArray], block: NDArray[np.int64], value: float, width: float | None = None) -> float:
     """Return the standard deviation of an edge effect's parameter at its maximum-likelihood value.
 
     It comes from the scatter between wall blocks of the derivative of the log-likelihood (sandwich estimator). It is valid
@@ -86,7 +84,7 @@ def std_from_blocks(
     Parameters
     ----------
     gains : function from the parameter's value to the (n,) log-likelihood ratios of the points.
-    block : (n,) number of each point's wall block, from `blocks_for_edges`.
+    block : (n,) number of each point's wall block, from `edge_blocks`.
     value : maximum-likelihood value of the parameter.
     width : half-width of the finite differences, unit of the parameter; None: a twentieth of the value.
     """

@@ -77,7 +77,7 @@ class _Losses:
 
     def fitted(
         self, probability: Callable[[FloatArray, FloatArray], FloatArray], x: FloatArray, starts: list[FloatArray]
-    ) -> _LossFit:
+    ) -> tuple[FloatArray, Callable[[FloatArray], float]]:
         """Fit a model of the probability of a loss by maximum likelihood.
 
         Parameters
@@ -85,6 +85,10 @@ class _Losses:
         probability : function of the model's parameters and of covariate values, which returns the probability for each value.
         x : (m,) covariate of each pulse, such as its range.
         starts : parameter vectors; the search begins at the most likely one.
+
+        Returns
+        -------
+        tuple : the parameters, and the negative log-likelihood as a function of parameters.
         """
         seen, lost = x[self.fit], self.lost[self.fit]
         every = slice(None, None, max(len(lost) // _MOST_PULSES, 1))
@@ -93,22 +97,8 @@ class _Losses:
         def cost(values: FloatArray) -> float:
             return -bernoulli_log_likelihood(lost, probability(values, seen))
 
-        found = minimize(cost, first, method="Nelder-Mead", options={"maxiter": 150, "xatol": 1e-3, "fatol": 0.05})
-        return _LossFit(found.x, -float(found.fun) - self.log_likelihood, probability(found.x, x), cost)
-
-
-@dataclass(frozen=True)
-class _LossFit:
-    """A fitted model of losses.
-
-    values: parameters at the maximum; gain: log-likelihood ratio against one probability for all pulses; probability: (m,);
-    cost: negative log-likelihood of parameters.
-    """
-
-    values: FloatArray
-    gain: float
-    probability: FloatArray
-    cost: Callable[[FloatArray], float]
+        options = {"maxiter": 150, "xatol": 1e-3, "fatol": 0.05}
+        return minimize(cost, first, method="Nelder-Mead", options=options).x, cost
 
 
 def explain_missing_returns(
@@ -207,10 +197,11 @@ def _fit_detection_limit(losses: _Losses, log_power: FloatArray) -> LossExplanat
         for level in np.quantile(log_power, [0.0, 0.02, 0.05, 0.1, 0.2, 0.35, 0.5, 0.65, 0.8, 0.95])
         for base in (0.003, 0.02, 0.08)
     ]
-    found = losses.fitted(probability, log_power, starts)
-    value = float(np.exp(np.clip(found.values[0], -_LARGEST_LOG_POWER, _LARGEST_LOG_POWER)) * 0.5)
-    std = {"minimum_power": value * float(np.exp(found.values[1]))}
-    return LossExplanation(DetectionLimit.tag(), found.gain, found.gain - 3.0, {"minimum_power": value}, std, found.probability)
+    best, cost = losses.fitted(probability, log_power, starts)
+    gain = -cost(best) - losses.log_likelihood
+    value = float(np.exp(np.clip(best[0], -_LARGEST_LOG_POWER, _LARGEST_LOG_POWER)) * 0.5)
+    parameters, std = {"minimum_power": value}, {"minimum_power": value * float(np.exp(best[1]))}
+    return LossExplanation(DetectionLimit.tag(), gain, gain - 3.0, parameters, std, probability(best, log_power))
 
 
 def _fit_precipitation(losses: _Losses, range_m: FloatArray, early: int, points: int) -> LossExplanation:
@@ -220,16 +211,16 @@ def _fit_precipitation(losses: _Losses, range_m: FloatArray, early: int, points:
         return np.asarray(1 - (1 - expit(values[1])) * np.exp(-2 * np.exp(values[0]) * x))
 
     starts = [np.array([np.log(rate), logit(base)]) for rate in np.geomspace(1e-6, 0.05, 20) for base in (0.003, 0.01, 0.03, 0.1)]
-    found = losses.fitted(probability, range_m, starts)
+    best, cost = losses.fitted(probability, range_m, starts)
     share = min(early / max(float(losses.lost.sum()) + early, 1.0), 1.0)
-    rate = max(float(np.exp(found.values[0])) / max(1 - share, 1e-3), 1e-6)
+    rate = max(float(np.exp(best[0])) / max(1 - share, 1e-3), 1e-6)
     drops = 10.0 * early if early > max(5, 1e-4 * points) else 0.0
     std = {
-        "rate_per_m": rate * _first_parameter_std(found.cost, found.values),
+        "rate_per_m": rate * _first_parameter_std(cost, best),
         "early_share": float(np.sqrt(share / max(early, 1))),
     }
-    gain, parameters = found.gain + drops, {"rate_per_m": rate, "early_share": share}
-    return LossExplanation(Precipitation.tag(), gain, gain - 2.0, parameters, std, found.probability)
+    gain, parameters = -cost(best) - losses.log_likelihood + drops, {"rate_per_m": rate, "early_share": share}
+    return LossExplanation(Precipitation.tag(), gain, gain - 2.0, parameters, std, probability(best, range_m))
 
 
 def _first_parameter_std(cost: Callable[[FloatArray], float], top: FloatArray) -> float:

@@ -112,13 +112,6 @@ class VarianceFit:
         score = gain - sum(candidates[number].cost for number in members)
         return cls(tuple(members), tuple(np.split(theta * scale, ends)), tuple(np.split(error * scale, ends)), gain, score)
 
-    def replaces_only(self, chosen: VarianceFit, number: int) -> bool:
-        """Tell whether this fit replaces one effect of another fit and keeps all the others.
-
-        chosen : the other fit; number : place of the replaced effect in the list of noise effects.
-        """
-        return number not in self.members and set(chosen.members) - {number} <= set(self.members)
-
     def added(self, shapes: list[FloatArray]) -> FloatArray:
         """Return the (n,) variance that the effects add, over the predicted one. shapes: the argument of `fitted`."""
         return np.asarray(sum(shapes[number] @ theta for theta, number in zip(self.theta, self.members, strict=True)))

@@ -274,10 +274,11 @@ class _SquaredDeviations:
     def terms(self, chosen: VarianceFit, p_value: float) -> list[VarianceTerm]:
         """Describe each effect of a fit, with those that cannot be told from it."""
         found, pair, single = [], self.best_pair, len(chosen.members) == 1
-        least = chosen.score - equivalence_margin(chosen.gain)
+        tried, least = self.singles if single else self.pairs, chosen.score - equivalence_margin(chosen.gain)
         for number, theta, error in zip(chosen.members, chosen.theta, chosen.error, strict=True):
             candidate = self.candidates[number]
-            others = [fit for fit in (self.singles if single else self.pairs) if fit.replaces_only(chosen, number)]
+            kept = {*chosen.members} - {number}
+            others = [fit for fit in tried if number not in fit.members and kept <= {*fit.members}]
             # two other effects that fit better, but by no more than the inexact part of one, may be the truth as well
             also = single and number not in pair.members
             others += [pair] if also and pair.score > chosen.score + thresholds().variance.least_gain else []

@@ -36,7 +36,6 @@ from pipeline.gap.report.wording import (
 from pipeline.gap.residuals.surface_residuals import SurfaceResiduals
 from pipeline.gap.thresholds import use_thresholds
 from pipeline.report.page import p_value_in_words, template
-from scene.geometry.mesh import FloatArray
 
 _MOST_TRIED = 25
 """Most explanations that the report lists."""
@@ -48,7 +47,11 @@ def to_dict(found: GapDiagnosis, measurement: Measurement) -> dict[str, Any]:
     found: the diagnosis. measurement: the measurement that was diagnosed; it is needed to give positions in the world frame.
     """
     pose = found.residuals.datum[:6] @ found.pose if isinstance(found.residuals, SurfaceResiduals) else found.pose
-    poses = [_registration(pose[start : start + 6], measurement) for start in range(0, len(pose), 6)]
+    to_world = measurement.frame.rotation.T
+    poses = [
+        {"translation_m": (to_world @ each[:3]).tolist(), "rotation_rad": (to_world @ each[3:]).tolist()}
+        for each in np.split(pose, range(6, len(pose), 6))
+    ]
     with use_thresholds(found.thresholds):
         gap = found.gap.to_dict() if found.gap else None
     return {
@@ -76,12 +79,6 @@ def _scale_entry(found: GapDiagnosis) -> dict[str, Any]:
         return {}
     scale = estimate_scale(found)
     return {"scale_ppm": {"value": None, "std": None} if scale is None else scale.to_dict()}
-
-
-def _registration(pose: FloatArray, measurement: Measurement) -> dict[str, Any]:
-    """The pose (6,) of a set-up, converted from the wall frame to the world frame."""
-    axes = measurement.frame.rotation
-    return {"translation_m": (axes.T @ pose[:3]).tolist(), "rotation_rad": (axes.T @ pose[3:]).tolist()}
 
 
 def write_report(out: Path, found: GapDiagnosis, measurement: Measurement) -> Path:
