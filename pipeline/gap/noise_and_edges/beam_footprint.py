@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from functools import cache, partial
+from itertools import product
 
 import numpy as np
 from numpy.typing import NDArray
@@ -79,12 +80,11 @@ def find_footprint(
         moved = shift_by(divergence_rad)[mode]
         return np.asarray(log_density(registered_residuals[rows], moved, sigma[rows]) - null)
 
-    best_divergence = {mode: maximise_gain(partial(gains, mode), _DIVERGENCES_RAD, ()) for mode in _MODES}
-    mode = max(best_divergence, key=lambda each: float(gains(each, best_divergence[each]).sum()))
-    gain = agreed_gain(gains(mode, best_divergence[mode]), block, thresholds().edges.least_block_sigmas)
+    mode, first = max(product(_MODES, _DIVERGENCES_RAD), key=lambda each: float(gains(*each).sum()))
+    gain = agreed_gain(gains(mode, first), block, thresholds().edges.least_block_sigmas)
     if gain is None:
         return []
-    divergence = maximise_gain(partial(gains, mode), [best_divergence[mode]], _REFINEMENT_FACTORS)
+    divergence = maximise_gain(partial(gains, mode), [first], _REFINEMENT_FACTORS)
     from_blocks = block_std(partial(gains, mode), block, divergence)
     std = {"divergence_rad": float(np.hypot(from_blocks, _PROFILE_UNCERTAINTY * divergence))}
     touched = np.abs(shift(np.arange(len(residuals)), (mode,), 1.5 * divergence)[mode]) > sigma

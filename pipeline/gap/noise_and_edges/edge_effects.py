@@ -27,11 +27,10 @@ class EdgeEffect:
 
     Attributes
     ----------
-    effect : the effect (of the known sensor effects) with its estimated parameters.
+    effect : the effect with its estimated parameters.
     std : standard deviations of its parameters, by parameter name.
     gain : log-likelihood ratio of the models with and without it.
-    touched : (n,) true for points whose shift by the effect cannot be predicted as precisely as the noise. Other fits leave
-        them out.
+    touched : (n,) points whose shift by the effect cannot be predicted as precisely as the noise. Other fits leave them out.
     """
 
     effect: Effect
@@ -78,8 +77,8 @@ def agreed_gain(
 def block_std(gains: Callable[[float], FloatArray], block: NDArray[np.int64], value: float, width: float | None = None) -> float:
     """Return the standard deviation of an edge effect's parameter at its maximum-likelihood value.
 
-    It comes from the scatter between wall blocks of the derivative of the log-likelihood (sandwich estimator). It is valid
-    although points in a wall block are correlated.
+    It comes from the scatter between wall blocks of the derivative of the log-likelihood (sandwich estimator), so points in a
+    wall block may be correlated.
 
     Parameters
     ----------
@@ -122,7 +121,7 @@ def maximise_gain(gains: Callable[[float], FloatArray], values: list[float], fac
     ----------
     gains : function from the parameter's value to the (n,) log-likelihood ratios of the points.
     values : values to try first.
-    factors : ratio of neighbouring values in each finer grid, coarsest first; empty: only `values` are tried.
+    factors : ratio of neighbouring values in each finer grid, coarsest first.
 
     Returns
     -------
@@ -137,4 +136,4 @@ def maximise_gain(gains: Callable[[float], FloatArray], values: list[float], fac
         curvature = low - 2 * middle + high
         step = float(np.clip(0.5 * (low - high) / curvature, -1.0, 1.0)) if curvature < 0 else 0.0
         best *= factor ** (top - 4)
-    return float(best * factors[-1] ** step) if factors else best
+    return float(best * factors[-1] ** step)

@@ -173,8 +173,8 @@ def separate_white_and_grid_noise(
 
     Grid-correlated noise comes from a stereo matcher that interpolates between widely spaced pixels (grid nodes). The
     semivariogram of the residuals decides. If it supports neither kind over the other, both are reported as indistinguishable.
-    Grid-correlated noise may also look like a variance that depends on a covariate such as the depth: points of similar depth
-    may belong to few nodes. It therefore replaces such an empirical term.
+    Grid-correlated noise also replaces a variance that depends on a covariate such as the depth, because points of similar
+    depth may belong to few nodes.
 
     Parameters
     ----------
@@ -197,14 +197,12 @@ def find_grid_noise(
 ) -> tuple[VarianceTerm | None, str]:
     """Find noise that neighbouring points share because the matcher interpolates it between widely spaced pixels (grid nodes).
 
-    Other noise terms are fitted to deviations from a plane within small squares of the wall. This noise hardly shows there,
-    because points near one node hardly differ by it. It needs a search of its own.
+    It needs a search of its own: points near one node hardly differ by it, so it hardly shows in the deviations from a plane
+    within small squares of the wall, to which other noise terms are fitted.
 
     Parameters
     ----------
-    part : disparity residuals of n points with their predicted standard deviations, px.
-    value : (n,) their values after the systematic effects are removed, px.
-    model : sensor model of the stereo pair.
+    part, value, model : arguments of `separate_white_and_grid_noise`.
     random : source of random numbers for the null distribution.
 
     Returns

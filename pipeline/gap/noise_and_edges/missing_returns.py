@@ -215,10 +215,7 @@ def _fit_precipitation(losses: _Losses, range_m: FloatArray, early: int, points:
     share = min(early / max(float(losses.lost.sum()) + early, 1.0), 1.0)
     rate = max(float(np.exp(best[0])) / max(1 - share, 1e-3), 1e-6)
     drops = 10.0 * early if early > max(5, 1e-4 * points) else 0.0
-    std = {
-        "rate_per_m": rate * _first_parameter_std(cost, best),
-        "early_share": float(np.sqrt(share / max(early, 1))),
-    }
+    std = {"rate_per_m": rate * _first_parameter_std(cost, best), "early_share": float(np.sqrt(share / max(early, 1)))}
     gain, parameters = -cost(best) - losses.log_likelihood + drops, {"rate_per_m": rate, "early_share": share}
     return LossExplanation(Precipitation.tag(), gain, gain - 2.0, parameters, std, probability(best, range_m))
 

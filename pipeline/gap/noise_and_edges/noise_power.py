@@ -28,14 +28,9 @@ def detectable_noise(
 ) -> list[DetectableSize]:
     """Compute from which size on noise terms would have been found in a measurement with a probability of 95 %.
 
-    Noise terms are fitted to deviations from a plane within small squares of the wall. Noise that neighbouring points share
-    hardly shows there, and is left out.
-
     Parameters
     ----------
-    residuals : Residuals of n points with their predicted standard deviations.
-    cells : The small squares of the wall.
-    value : (n,) residuals after the systematic effects are removed, m (ranges) or px (disparities).
+    residuals, cells, value : arguments of `fit_variance_model`, which would have found them.
     named : Names of effects that were found, which are not listed.
     random : Source of random numbers, for the null distribution of the test statistic.
 

@@ -43,9 +43,7 @@ side, which moves the last seam by half a cell."""
 
 @dataclass(frozen=True)
 class TileSeams:
-    """Square image tiles that were found in disparities: a stereo matcher processed them separately and shifted them.
-
-    Neighbouring tiles are shifted in opposite directions, so their disparities differ by twice the amplitude.
+    """Square image tiles that a stereo matcher processed separately and shifted, neighbours in opposite directions.
 
     Attributes
     ----------
@@ -212,7 +210,7 @@ def find_tile_seams(residuals: StereoResiduals, registered_residuals: FloatArray
 class UnequalTiles:
     """Square image tiles whose disparities jump at their seams by amounts that follow no pattern.
 
-    The catalogue has no effect for them: a matcher that processes tiles separately may shift each by another amount.
+    The catalogue has no effect for them.
 
     Attributes
     ----------

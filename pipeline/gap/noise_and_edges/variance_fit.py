@@ -65,13 +65,12 @@ class VarianceCandidate:
 
 @dataclass(frozen=True)
 class VarianceFit:
-    """Some noise effects of a list, fitted together to squared deviations.
+    """Some noise effects of a list of candidates, fitted together to squared deviations.
 
     Attributes
     ----------
     members : places of the effects in the list.
-    theta, error : for each effect, the (k,) fitted factors of its variance and their standard deviations; a factor of 1 is the
-        variance at the typical size of the parameter.
+    theta, error : for each effect, the (k,) fitted factors of its variance (`VarianceCandidate`) and their standard deviations.
     gain : log-likelihood ratio of the models with and without the effects.
     score : gain minus the penalties of the effects.
     """
@@ -89,9 +88,9 @@ class VarianceFit:
         """Fit the variance 1 + sum theta f to squared deviations by Fisher scoring, with theta >= 0.
 
         squares : (n,) squared deviations of the residuals over their predicted variance.
-        shapes : for each noise effect of the list, the (n, k) variance f that its parameters add over the predicted one.
-        members : places in the list of the effects that are fitted.
-        candidates : the list of noise effects.
+        shapes : for each candidate, the (n, k) variance f that its parameters add over the predicted one.
+        members : places of the candidates that are fitted.
+        candidates : the list of candidates.
         """
         columns = np.concatenate([shapes[number] for number in members], axis=1)
         scale = 1 / np.maximum(columns.mean(axis=0), 1e-300)
@@ -138,8 +137,8 @@ class BinnedVariance:
 def best_binned_variance(squares: FloatArray, covariates: Mapping[str, FloatArray]) -> BinnedVariance:
     """Return the covariate along which a variance free in each bin explains most.
 
-    If the tails are heavier than those of a normal distribution, the variances of bins differ more by chance, by a factor that
-    follows from the kurtosis. What the bins explain beside their common mean is divided by this factor.
+    Heavier tails than those of a normal distribution make the variances of bins differ more by chance. What the bins explain
+    beside their common mean is therefore divided by a factor that follows from the kurtosis.
 
     squares : (n,) squared deviations of the residuals over their predicted variance.
     covariates : (n,) values of each covariate, by name.

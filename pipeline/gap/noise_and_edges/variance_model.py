@@ -72,8 +72,7 @@ class VarianceScore:
     Attributes
     ----------
     name : name of the effect; for a variance fitted freely to a covariate (empirical term), that covariate.
-    gain : log-likelihood ratio of the models with and without the term.
-    score : gain minus the number of parameters.
+    gain, score : log-likelihood ratio of the models with and without the term, and the same minus the number of parameters.
     empirical : whether the term is not in the catalogue.
     """
 
@@ -328,7 +327,7 @@ def _unshared_share(residuals: Residuals, value: FloatArray, used: BoolArray, ad
 class NoiseRatio:
     """Observed over predicted standard deviation of residuals, to tell whether the sensor model's noise is right.
 
-    It is computed from deviations from planes in small squares of the wall, without errors that vary slowly over the wall.
+    Errors that vary slowly over the wall do not count, as in `standardised_deviations`.
 
     Attributes
     ----------
@@ -345,9 +344,7 @@ class NoiseRatio:
 
         Parameters
         ----------
-        residuals : residuals of n points with their predicted standard deviations.
-        cells : small squares of the wall; deviations from a plane within each are used.
-        value : (n,) residuals after the systematic effects are removed, m (ranges) or px (disparities).
+        residuals, cells, value : arguments of `standardised_deviations`.
         random : source of random numbers, with which correlated noise is simulated.
         """
         z = standardised_deviations(residuals, cells, value)
@@ -356,8 +353,7 @@ class NoiseRatio:
             return cls(1.0, False)
         squares = np.minimum(z[used] ** 2, _CLIP_SIGMAS**2) / _expected_mean_square(residuals, cells, random)
         means = np.bincount(np.unique(cells.blocks.numbers(residuals.wall_xy[used]), return_inverse=True)[1], squares - 1)
-        below = float(means.sum()) < -thresholds().edges.block_sigmas * float(np.linalg.norm(means))
-        return cls(float(np.sqrt(squares.mean())), below)
+        return cls(float(np.sqrt(squares.mean())), agreement(means) < -thresholds().edges.block_sigmas)
 
     @property
     def at_most_one(self) -> float:

@@ -13,7 +13,7 @@ from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 from pipeline.change.robust import nmad
 from pipeline.gap.naming.gap_score import Gap
 from pipeline.gap.naming.workflow import GapDiagnosis
-from pipeline.gap.report.covariate_ranking import inliers, quantile_bins, standardised_by_covariate
+from pipeline.gap.report.covariate_ranking import inliers, quantile_bins
 from pipeline.gap.report.wording import covariate_with_unit
 from pipeline.gap.residuals.surface_residuals import SurfaceResiduals, predicted_sigma
 from pipeline.gap.residuals.tls_residuals import TlsResiduals
@@ -87,13 +87,7 @@ def _colour_limit(means: FloatArray) -> float:
 def sigma_after(found: GapDiagnosis) -> FloatArray:
     """Return the standard deviation of each point's noise that the sensor model with the named effects predicts.
 
-    Returns
-    -------
-    FloatArray : (n,) standard deviations, in the unit of the observable (m or px).
-
-    Raises
-    ------
-    TypeError : model and residuals are of different sensors.
+    They are (n,) in the unit of the observable (m or px). Raises TypeError if model and residuals are of different sensors.
     """
     match found.model_after, found.residuals:
         case TlsModel() as model, TlsResiduals(geometry=rays) as ranges:
@@ -111,13 +105,13 @@ def profiles_figure(found: GapDiagnosis) -> bytes:
     Two colours show the residuals without and with the named effects, with bands of two standard errors. A black line shows
     what the effects explain, and dashed lines the predicted standard deviation.
     """
-    names = [name for name, _, _ in standardised_by_covariate(found)]
+    used = inliers(found)
+    names = list(found.residuals.covariates) if used.any() else []
     rows = max((len(names) + _COLUMNS - 1) // _COLUMNS, 1)
     figure = Figure(figsize=(11.5, 4.0 * rows))
     panels = np.atleast_2d(figure.subplots(2 * rows, _COLUMNS, height_ratios=[1.4, 1.0] * rows))
     # fixed margins in inches: a computed layout takes as long as the drawing
     figure.subplots_adjust(0.055, 0.3 / (4.0 * rows), 0.99, 1 - 0.3 / (4.0 * rows), wspace=0.22, hspace=0.33)
-    used = inliers(found)
     unit = 1e3 * found.residuals.depth_m[used]
     before, after = found.before[used] * unit, found.after[used] * unit
     predicted = found.residuals.sigma[used] * np.abs(unit), sigma_after(found)[used] * np.abs(unit)

@@ -28,10 +28,8 @@ def unseen_entry(found: GapDiagnosis) -> list[dict[str, Any]]:
 def unseen_rows(found: GapDiagnosis) -> list[dict[str, str]]:
     """Return the rows of the report's table of sensor errors that may be there although the diagnosis did not name them.
 
-    Returns
-    -------
-    list : for each error the table's columns: `name`; `size`, from which it would have shown with a probability of 95 %; and
-        `note`: the period or camera for which the size holds, or why there is no size.
+    Each has `name`; `size`, from which it would have shown with a probability of 95 %; and `note`: the period or camera for
+    which the size holds, or why there is no size.
     """
     return [
         {

@@ -181,10 +181,7 @@ def join_words(words: Sequence[str]) -> str:
 def covariate_with_unit(covariate: str, sensor: str) -> str:
     """Return a covariate (a quantity on which an error may depend) in words with its unit, such as "range, m".
 
-    Parameters
-    ----------
-    covariate : name of the covariate, such as "range".
-    sensor : "tls" or "stereo"; a covariate without a unit of its own has that of the observable, m or px.
+    sensor: "tls" or "stereo"; a covariate without a unit of its own has that of the observable, m or px.
     """
     _, unit = _COVARIATES.get(covariate, ("", ""))
     return f"{covariate_name(covariate)}, {unit or ('m' if sensor == 'tls' else 'px')}"
@@ -271,9 +268,9 @@ def _describe_empirical(effect: NamedEffect) -> str:
 
 
 def describe_gap(found: GapDiagnosis) -> str:
-    """Return a sentence for the report with the scores of the sensor model without and with the named effects.
+    """Return a sentence with the scores of the sensor model without and with the named effects, and that of noise alone.
 
-    It also states the score that noise alone gives. It is "" if nothing was scored.
+    It is "" if nothing was scored.
     """
     if found.gap is None:
         return ""
