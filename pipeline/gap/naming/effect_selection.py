@@ -387,8 +387,8 @@ def _p_value_beside(points: SearchInput, found: SearchOutcome, kept: frozenset[s
     estimates = {f"{points.part.sensor}.{each.candidate.name}": each for each in found.estimates if not each.candidate.empirical}
     if not kept <= set(estimates):
         return None
-    again = repeat_search(points, [estimates[name] for name in sorted(kept)], found.search.single_effect_ratios)
-    return None if again is None else again[0].goodness_of_fit_p_value(again[0].score_families(()))
+    again = repeat_search(points, found, [estimates[name] for name in sorted(kept)])
+    return None if again is None else again.search.goodness_of_fit_p_value(again.search.score_families(()))
 
 
 def _detectable_sizes(
