@@ -318,8 +318,9 @@ class Design:
             value = value - candidate.columns @ coefficients[: candidate.columns.shape[1]]
         return np.asarray(value)
 
+    @cached_property
     def identifiability(self) -> tuple[list[str], FloatArray, FloatArray]:
-        """Compare the signatures of all effects, to show which sensor errors this measurement cannot tell apart.
+        """Similarity of the signatures of all effects, which shows which sensor errors this measurement cannot tell apart.
 
         An effect's signature is the pattern of residuals that it makes. Two effects whose signatures have a cosine near 1 in
         magnitude cannot be distinguished. If a change of the sensor's pose makes nearly the same residuals, the effect cannot be
