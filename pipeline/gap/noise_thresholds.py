@@ -56,8 +56,9 @@ class VarianceThresholds(ThresholdGroup):
     nonparametric_share: PositiveFloat = threshold_field(
         0.1,
         "share of the named term's log-likelihood ratio",
-        "A variance free in bins that gains no more than this over the named term is only a note; beyond, the term is marked "
-        "empirical. Known noise put into real scans came to 0.05 and 0.09, and noise outside the catalogue to 0.15.",
+        "A variance free in bins that gains no more than this over the named term is only a note; beyond, or if the wall blocks "
+        "agree by `edges.block_sigmas`, the term is marked empirical. Known noise put into real scans came to 0.05 and 0.09, and "
+        "noise outside the catalogue to 0.15.",
         DEVELOPMENT,
     )
     tail_sigmas: PositiveFloat = threshold_field(
@@ -133,8 +134,9 @@ class EdgeThresholds(ThresholdGroup):
     block_sigmas: PositiveFloat = threshold_field(
         3.0,
         "root sums of squares of the wall blocks' gains",
-        "The wall blocks must agree by this much on an edge effect, on a second noise term, on grid-correlated noise where "
-        "single points show no added variance, or on noise that is lower than predicted.",
+        "The wall blocks must agree by this much on an edge effect, on a second noise term, on a variance free in bins that is "
+        "as sure as a second term, on grid-correlated noise where single points show no added variance, or on noise that is "
+        "lower than predicted.",
         JUDGEMENT,
     )
     least_filled_share: PositiveFloat = threshold_field(

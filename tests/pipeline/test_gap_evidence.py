@@ -163,6 +163,22 @@ def test_noise_of_some_scan_lines_gets_no_name(tmp_path: Path, cycle: int) -> No
     assert note == ("the noise varies with line, which no effect of the catalogue explains" if cycle > 1 else "")
 
 
+@pytest.mark.parametrize("share", [0.0, 0.5])
+def test_strong_noise_that_differs_between_halves_gets_no_name(tmp_path: Path, share: float) -> None:
+    """Noise of four times the predicted variance is range noise, unless it is smaller on one side of the scan than on the other.
+
+    A free form then gains less than 0.1 of what range noise gains, but the wall blocks agree on it.
+    """
+    write_scan(tmp_path, 3, step_rad=0.006)
+    _, residuals, _ = align(read_measurement(tmp_path))
+    part = residuals.part(residuals.usable)
+    side = np.sign(part.covariates["azimuth"] - np.median(part.covariates["azimuth"]))
+    value = part.sigma * np.sqrt(1 + 4 * (1 + share * side)) * np.random.default_rng(4).standard_normal(len(part))
+    (found,), _, note = fit_variance_model(part, WallCells.over(part.wall_xy), value, KeyedRandom(1))
+    assert (found.effect, found.empirical) == ("range_noise", share > 0)
+    assert note.startswith("the noise varies with") == (share > 0)  # with azimuth or time, which are the same here
+
+
 def test_what_a_free_form_misses_of_a_drift_gets_no_name(tmp_path: Path) -> None:
     """The ranges drift by 20 mm in the first tenth of the scan, as no effect of the catalogue does."""
     write_scan(tmp_path, 6, ranges=lambda scan: scan.R + 0.02 * np.exp(-scan.share / 0.1), step_rad=0.006)

@@ -184,9 +184,11 @@ def fit_variance_model(
     added = added_by_pair if chosen is pair else added
     free = best_binned_variance(seen.squares, {name: each[seen.used] for name, each in residuals.covariates.items()})
     tried = sorted([*tried, VarianceScore(free.name, free.gain, free.score, True)], key=lambda item: -item.score)
-    if not seen.is_clearly_better(free.score - chosen.score, added, free.added, edges.least_block_sigmas):
+    lead = free.score - chosen.score
+    if not seen.is_clearly_better(lead, added, free.added, edges.least_block_sigmas):
         return seen.terms(chosen, p_value), tried, ""
-    empirical = free.score - chosen.score > by.nonparametric_share * chosen.gain
+    as_sure_as_a_second_term = seen.is_clearly_better(lead, added, free.added, edges.block_sigmas)
+    empirical = as_sure_as_a_second_term or lead > by.nonparametric_share * chosen.gain
     named = [replace(each, empirical=empirical) for each in seen.terms(best if empirical else chosen, p_value)]
     varies = "varies" if empirical else "also varies"
     return named, tried, f"the noise {varies} with {free.name}, which no effect of the catalogue explains"
