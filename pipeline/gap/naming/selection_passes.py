@@ -185,10 +185,9 @@ class SelectionPass:
         random : source of random numbers for the null distributions.
         excluded : effects that are not tried, as pairs (name, whether it is an empirical term).
         """
-        given = pass_input
-        noise = None if given.large_effect is None else given.registered_residuals[given.training_rows]
-        selected = select_effects(SelectionInput(*given.training_part, given.noise_ratio, random, excluded, noise))
-        return cls(given, *selected)
+        noise = None if pass_input.large_effect is None else pass_input.registered_residuals[pass_input.training_rows]
+        given = SelectionInput(*pass_input.training_part, pass_input.noise_ratio, random, excluded, noise)
+        return cls(pass_input, *select_effects(given))
 
 
 def _names(effects: list[EdgeEffect]) -> set[str]:
