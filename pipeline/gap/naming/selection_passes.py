@@ -96,8 +96,7 @@ class PassInput:
         plain : its residuals without edge effects.
         held_out_points : (N,) true for points that are kept for validation.
         edge_effects : edge effects to put into the model. Their attribute `touched` must have a value for each of the N points.
-        large_effect : an error so large that without it much of the rock would count as changed. It is in the model while
-            changes and outliers are found, and not in the residuals.
+        large_effect : see the attribute.
         """
         touched = np.any([np.zeros(len(plain), dtype=bool), *(each.touched[plain.index] for each in edge_effects)], axis=0)
         registration_rows = plain.index[~(touched | held_out_points[plain.index])]
@@ -197,10 +196,9 @@ def _names(effects: list[EdgeEffect]) -> set[str]:
 
 @dataclass(frozen=True, eq=False)
 class PassInputs:
-    """Prepares the input of a search for sensor errors, with any choice of edge effects in the sensor model.
+    """Prepares the input of a search for sensor errors, with any choice of edge effects (`PassInput`) in the sensor model.
 
-    Edge effects are errors at depth steps: edge fattening, smoothing, filled occlusions and the beam footprint. Other errors
-    can hide or imitate them, so they are searched again beside the errors that a search has named.
+    Other errors can hide or imitate edge effects, so these are searched again beside the errors that a search has named.
 
     Attributes
     ----------
@@ -345,14 +343,10 @@ def _with_effects(
     touched: BoolArray,
     registration_rows: NDArray[np.int64],
 ) -> tuple[Measurement, Residuals, BoolArray]:
-    """Put effects into the model, as entries of a config.
+    """Put effects into the model, as entries of a config, and estimate the pose again from `registration_rows` of the points.
 
-    The pose is estimated again from `registration_rows`, rows of the measurement's points. touched: (n,) points
-    that the effects move, which then may not be used.
-
-    Returns
-    -------
-    The measurement, the residuals of the same n points, and (n,) true for those that see smooth surface with the effects.
+    It returns the measurement, the residuals of the same n points, and (n,) true for those that see smooth surface with the
+    effects. touched: (n,) points that the effects move, which then may not be used.
     """
     if not entries:
         return measurement, residuals, residuals.on_smooth_surface
