@@ -59,10 +59,7 @@ class NodeField:
 
     @cached_property
     def variance(self) -> float:
-        """Variance of the grid-correlated noise at a point, averaged over a sample of the points, px².
-
-        It is 0 if the noise model has no grid nodes.
-        """
+        """Variance of the grid-correlated noise at a point, averaged over a sample of the points, px²; 0 without nodes."""
         some = self.weights[:: max(self.weights.shape[0] // _SAMPLE, 1)]
         return float(np.mean((some @ self.covariance * some.toarray()).sum(axis=1))) if some.shape[1] else 0.0
 
@@ -92,12 +89,9 @@ class GridCorrelatedNoise:
 
     @classmethod
     def of(cls, model: StereoModel, pixels: FloatArray) -> GridCorrelatedNoise:
-        """Collect those noise terms of a sensor model that neighbouring points share (grid-correlated noise).
+        """Collect those noise terms of a stereo pair's sensor model that neighbouring points share (grid-correlated noise).
 
-        Parameters
-        ----------
-        model : The sensor model of the stereo pair; its other noise terms are ignored.
-        pixels : (n, 2) column and row of each point in the left image, px.
+        pixels: (n, 2) column and row of each point in the left image, px.
         """
         return cls(_grid_correlated(model.matching_noise), pixels)
 
@@ -106,10 +100,7 @@ class GridCorrelatedNoise:
         return self if self.pixels is None else replace(self, pixels=self.pixels[rows])
 
     def with_effects(self, effects: Sequence[MatchingNoise]) -> GridCorrelatedNoise:
-        """Return this grid-correlated noise with further noise terms added.
-
-        effects: noise terms of a stereo matcher; those that are not grid-correlated (such as white noise) are ignored.
-        """
+        """Return this noise with the grid-correlated ones among further noise terms of a stereo matcher added."""
         return replace(self, effects=(*self.effects, *_grid_correlated(effects)))
 
     def node_field(self, count: int) -> NodeField:
@@ -119,20 +110,16 @@ class GridCorrelatedNoise:
 
         count: number n of points. Without grid-correlated noise the matrix of weights is (n, 0).
         """
-        if self.pixels is None or not count:
-            return _empty_field(count)
-        area = float(np.prod(np.maximum(np.ptp(self.pixels, axis=0), 1.0)))
-        coarse = [effect for effect in self.effects if effect.step_px**2 > area / count]
-        return _on_nodes(coarse, self.pixels, area) if coarse else _empty_field(count)
+        if self.pixels is not None and count:
+            area = float(np.prod(np.maximum(np.ptp(self.pixels, axis=0), 1.0)))
+            coarse = [effect for effect in self.effects if effect.step_px**2 > area / count]
+            if coarse:
+                return _on_nodes(coarse, self.pixels, area)
+        return NodeField(sparse.csr_array((count, 0)), np.zeros((0, 0)))
 
 
 NO_CORRELATED_NOISE = GridCorrelatedNoise()
 """Nothing that neighbouring points share."""
-
-
-def _empty_field(count: int) -> NodeField:
-    """A field without nodes for `count` points."""
-    return NodeField(sparse.csr_array((count, 0)), np.zeros((0, 0)))
 
 
 def _on_nodes(effects: list[NodeNoise], pixels: FloatArray, area: float) -> NodeField:
@@ -145,10 +132,7 @@ def _on_nodes(effects: list[NodeNoise], pixels: FloatArray, area: float) -> Node
     step = max(min(effect.step_px for effect in effects) / 2, float(np.sqrt(area / _MOST_NODES)))
     weights, nodes = _bilinear(pixels, step)
     place = np.rint(nodes / step).astype(np.int64)
-    matrix = sum(
-        (_covariance_of_nodes(place, _covariance_by_offset(effect, step)) for effect in effects),
-        np.zeros((len(nodes), len(nodes))),
-    )
+    matrix = np.sum([_covariance_of_nodes(place, _covariance_by_offset(effect, step)) for effect in effects], axis=0)
     return NodeField(weights, matrix + _RIDGE * matrix[0, 0] * np.eye(len(nodes)))
 
 

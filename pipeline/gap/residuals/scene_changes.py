@@ -99,8 +99,8 @@ class SceneChange:
         frame: the wall frame of the measurement, which converts to the world frame.
         """
         world = frame.to_world(self.corners)
-        return {"bbox_m": [*world.min(axis=0).tolist(), *world.max(axis=0).tolist()], "volume_m3": self.volume_m3,
-                "volume_std_m3": self.volume_std_m3}  # fmt: skip
+        box = [*world.min(axis=0).tolist(), *world.max(axis=0).tolist()]
+        return {"bbox_m": box, "volume_m3": self.volume_m3, "volume_std_m3": self.volume_std_m3}
 
 
 def find_scene_changes(residuals: Residuals, view: SensorView, eligible: BoolArray) -> tuple[list[SceneChange], BoolArray]:
@@ -120,8 +120,6 @@ def find_scene_changes(residuals: Residuals, view: SensorView, eligible: BoolArr
     The changed regions, largest volume first; and (n,) true for points in such a region or within three point spacings of one.
     """
     beside = np.zeros(len(residuals), dtype=bool)
-    departure, error = np.zeros(len(residuals)), np.zeros((2, len(residuals)))
-    label = np.full(len(residuals), -1)
     if eligible.sum() < NEIGHBOURS:
         return [], beside
     for _ in range(_ROUNDS):
@@ -135,8 +133,7 @@ def find_scene_changes(residuals: Residuals, view: SensorView, eligible: BoolArr
         faint = medians / np.maximum(scatter, _LEAST_MEDIAN_STD)
         faint[np.abs(medians) * residuals.sigma * residuals.unit_m < thresholds().points.reference_error] = 0.0
         label, limit = _components(z, faint, view, eligible)
-        members = np.flatnonzero(label >= 0)
-        beside = view.near(members, thresholds().changes.margin) if len(members) else np.zeros(len(residuals), dtype=bool)
+        beside = view.near(np.flatnonzero(label >= 0), thresholds().changes.margin)
         if not (beside & ~before).any():
             break
     limited = departure * np.minimum(1.0, limit / np.maximum(np.abs(z), 1e-12))
@@ -184,7 +181,7 @@ def moved_share(residuals: Residuals, view: SensorView, eligible: BoolArray) -> 
 def _components(z: FloatArray, faint: FloatArray, view: SensorView, eligible: BoolArray) -> tuple[NDArray[np.int64], FloatArray]:
     """Number of the change that contains each point (n,), -1 for none, and the sigmas (n,) that its neighbours confirm.
 
-    `z`: (n,) standardised residuals; `faint`: (n,) standardised medians of neighbours.
+    z: (n,) standardised residuals. faint: (n,) standardised medians of neighbours.
     """
     exceeds = np.abs(faint) > thresholds().changes.faint_sigmas
     side = np.where(exceeds, np.sign(faint), np.sign(z)) * (exceeds | (np.abs(z) > _LEVELS[0]))
@@ -247,20 +244,12 @@ def _significant(z: FloatArray, level: float, ratio: float, pairs: Pairs, eligib
 
 
 def _log_expected(count: NDArray[np.int64], points: int, stray: int, agreeing: float) -> FloatArray:
-    """Return log E(m), the logarithm of the number of components of m points expected by chance.
+    """Return log E(m), the logarithm of the number of components of m points expected by chance, for sizes m (k,).
 
-    Parameters
-    ----------
-    count : (k,) m, the number of points of each component.
-    points : Number of points searched.
-    stray : How many of them exceed the level by chance.
-    agreeing : Share of pairs of values that agree.
+    points: number N of points searched. stray: how many of them exceed the level by chance. agreeing: share c of pairs of values
+    that agree.
     """
-    shapes = np.where(
-        count <= len(_SHAPES),
-        _SHAPES[np.minimum(count, len(_SHAPES)) - 1],
-        _SHAPES[-1] + _GROWTH * (count - len(_SHAPES)),
-    )
+    shapes = _SHAPES[np.minimum(count, len(_SHAPES)) - 1] + _GROWTH * np.maximum(count - len(_SHAPES), 0)
     share = np.log(max(stray, 1) / points)
     return np.asarray(np.log(points) + shapes + count * share + (count - 1) * np.log(agreeing))
 
@@ -332,8 +321,6 @@ def _measure_changes(label: NDArray[np.int64], departure: FloatArray, error: Flo
     error: (2, n) independent and common standard deviation of each ray's residual, m.
     """
     rows = np.flatnonzero(label >= 0)
-    if not len(rows):
-        return []
     solid = view.solid_angles(rows)
     near, far = view.reference_m[rows], view.range_at_residual(rows, departure[rows])
     volume = (far**3 - near**3) / 3 * solid
@@ -341,9 +328,9 @@ def _measure_changes(label: NDArray[np.int64], departure: FloatArray, error: Flo
     width = 0.5 * np.sqrt(area)
     own, common = error[:, rows] * area
     surfaces = [view.points_at(rows, each) for each in (near, far)]
-    order = np.argsort(label[rows], kind="stable")
     found = []
-    for part in np.split(order, np.flatnonzero(np.diff(label[rows][order])) + 1):
+    for number in np.unique(label[rows]):
+        part = np.flatnonzero(label[rows] == number)
         corners = np.concatenate([_box(surface[part], width[part]) for surface in surfaces])
         moved = float(np.median((far - near)[part]))
         epochs = view.epoch[rows[part]]

@@ -8,11 +8,10 @@ from typing import Any
 import numpy as np
 
 from pipeline.gap.noise_and_edges.variance_model import variance_candidates
-from pipeline.gap.survey.survey_design import DETECTION_SNR, view_signatures
+from pipeline.gap.survey.survey_design import DETECTION_SNR
 from pipeline.gap.survey.survey_views import Survey, SurveyView, TlsView
 from pipeline.gap.thresholds import thresholds
 from sensors.effects import catalogue
-from sensors.effects.base import Effect
 from sensors.effects.detection_limit import DetectionLimit
 from sensors.effects.precipitation import Precipitation
 from sensors.effects.range_quantization import RangeQuantization
@@ -60,29 +59,22 @@ def noise_and_loss_effects(survey: Survey) -> tuple[NoiseOrLossEffect, ...]:
     found = {each.name: each for each in _variance_effects(view)}
     if isinstance(view, TlsView):
         found |= {each.name: each for each in (_quantisation(), _detection_limit(view), _precipitation(view))}
-    names = {f"{survey.sensor}.{effect.tag()}": effect for effect in catalogue(survey.sensor)}
-    mean = _systematic_names(view)
-    unknown = {name: NoiseOrLossEffect(name, "", np.nan, _unknown(effect)) for name, effect in names.items()}
-    return tuple(found.get(name, unknown[name]) for name in names if name not in mean)
-
-
-def _unknown(effect: type[Effect]) -> str:
-    """Why an effect has no detectable size here."""
-    return f"needs {' and '.join(effect.needs)}: gap does not test it" if effect.needs else _NO_NUMBER
-
-
-def _systematic_names(view: SurveyView) -> set[str]:
-    """Names of the systematic effects."""
-    return {f"{view.residuals.sensor}.{candidate.name}" for candidate in view_signatures(view)}
+    systematic = {candidate.name for candidate in view.signatures}
+    others = []
+    for effect in catalogue(survey.sensor):
+        name = f"{survey.sensor}.{effect.tag()}"
+        note = f"needs {' and '.join(effect.needs)}: gap does not test it" if effect.needs else _NO_NUMBER
+        if effect.tag() not in systematic:
+            others.append(found.get(name) or NoiseOrLossEffect(name, "", np.nan, note))
+    return tuple(others)
 
 
 def _variance_effects(view: SurveyView) -> list[NoiseOrLossEffect]:
     """Effects on the variance: sigma_i² = model + theta f_i has the information sum (f_i / sigma_i²)² / 2 on theta."""
     residuals = view.residuals
-    candidates = variance_candidates(residuals)
     found: dict[str, NoiseOrLossEffect] = {}
     excess = thresholds().variance.least_excess
-    for candidate in candidates:
+    for candidate in variance_candidates(residuals):
         form = candidate.variance.sum(axis=1) / residuals.sigma**2
         information = 0.5 * float(np.sum(form**2)) * view.point_count / len(residuals)
         theta = DETECTION_SNR / np.sqrt(max(information, 1e-300))

@@ -9,14 +9,16 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any, ClassVar, Self
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pipeline.config.simulation import SensorName, SimulationConfig
 from pipeline.formats.measurements.measurement import Measurement, StereoMeasurement, SurfaceMeasurement, TlsMeasurement
 from pipeline.formats.point_cloud import PointCloud
+from pipeline.gap.mean.candidates import Candidate
+from pipeline.gap.mean.signatures import systematic_candidates
 from pipeline.gap.residuals.residuals import Residuals
 from pipeline.gap.residuals.stereo_residuals import StereoResiduals, stereo_residuals
 from pipeline.gap.residuals.tls_residuals import TlsResiduals, tls_residuals
@@ -24,7 +26,6 @@ from pipeline.run.site import prepare_site
 from scene.common.errors import InputError
 from scene.common.keyed_random import KeyedRandom
 from scene.geometry.mesh import FloatArray
-from scene.ray_casting.raycast import RayCaster
 from sensors.cameras.camera import Camera, CameraPair
 from sensors.laser.tls import LaserScanner, ScannerConfig
 from sensors.models.sensor_model import StereoModel, TlsModel, TlsNoise
@@ -56,7 +57,8 @@ class SurveyView:
     residuals : Geometry of n points, a subsample on smooth parts of the wall; the residual values have no meaning.
     point_count : Number of points on smooth parts in the full view.
     station : Number of the station or pair, from 0; views with the same number share a pose.
-    measurement : A measurement that holds the pose of the station or the cameras of the pair.
+    measurement : A measurement that holds the pose of the station or the cameras of the pair. A planned station or pair has
+        simulated points without noise.
     """
 
     residuals: Residuals
@@ -72,8 +74,7 @@ class SurveyView:
         ----------
         found : Geometry of the subsample, as residuals whose values have no meaning.
         whole : Number of points of the full view, before the subsample was drawn.
-        number : Number of the station or pair; views with the same number share a pose.
-        measurement : A measurement that holds the pose of the station or the cameras of the pair.
+        number, measurement : The fields `station` and `measurement`.
 
         Raises
         ------
@@ -89,6 +90,12 @@ class SurveyView:
             )
         return cls(found.part(smooth), int(whole * len(smooth) / len(found)), number, measurement)
 
+    @classmethod
+    def subsampled(cls, found: Residuals, most: int, number: int, measurement: Measurement) -> Self:
+        """Make the view of a station or pair from all its points: about `most` points on smooth parts of the wall are kept."""
+        smooth = np.flatnonzero(found.usable)
+        return cls(found.part(smooth[:: max(len(smooth) // most, 1)]), len(smooth), number, measurement)
+
     @property
     def sigma(self) -> FloatArray:
         """(n,) standard deviations of the points of the subsample, m (ranges) or px (disparities), to predict precision.
@@ -97,17 +104,36 @@ class SurveyView:
         """
         return self.residuals.sigma * np.sqrt(len(self.residuals) / max(self.point_count, 1))
 
+    @cached_property
+    def signatures(self) -> list[Candidate]:
+        """How each systematic effect would change the observations, by the name of the effect: its signature.
+
+        An effect with parameters that cannot be fitted, such as a camera or a period, is listed once for each trial value.
+        """
+        return systematic_candidates(self.residuals, self.measurement)
+
+    def signature_columns(self, wanted: list[Candidate]) -> FloatArray:
+        """Return the change (n, k) of the n observations, m or px, per unit of each of the k coefficients of given effects.
+
+        wanted: the effects, each with one choice of what is not fitted, such as the camera or the period of a wave. Pass the
+        same list for all stations of a survey, so that the columns of all have the same meaning.
+        """
+        own = {_key(each): each for each in self.signatures}
+        found = [(variant, own[_key(variant)]) for variant in wanted]
+        return np.concatenate(
+            [each.columns if each.wave is None else each.wave.columns(variant.period) for variant, each in found], axis=1
+        )
+
+
+def _key(candidate: Candidate) -> tuple[Any, ...]:
+    """Key by which the same variant is found in another view."""
+    fixed = {key: value for key, value in candidate.fixed.items() if candidate.wave is None or key != candidate.wave.key}
+    return candidate.name, candidate.names, tuple(sorted(fixed.items(), key=str))
+
 
 @dataclass(frozen=True)
 class TlsView(SurveyView):
-    """What one scanner station, real or planned, sees of the wall.
-
-    Attributes
-    ----------
-    residuals : Geometry of the rays of n points, a subsample on smooth parts; the residual values have no meaning, because only
-        the geometry is used.
-    measurement : A measurement with the pose of the station. A planned station has simulated points without noise.
-    """
+    """What one scanner station, real or planned, sees of the wall (see `SurveyView`)."""
 
     residuals: TlsResiduals
     measurement: TlsMeasurement
@@ -115,14 +141,7 @@ class TlsView(SurveyView):
 
 @dataclass(frozen=True)
 class StereoView(SurveyView):
-    """What one stereo pair, real or planned, sees of the wall.
-
-    Attributes
-    ----------
-    residuals : Geometry of the pixels of n points, a subsample on smooth parts; the residual values have no meaning, because
-        only the geometry is used.
-    measurement : A measurement with the cameras of the pair.
-    """
+    """What one stereo pair, real or planned, sees of the wall (see `SurveyView`)."""
 
     residuals: StereoResiduals
     measurement: StereoMeasurement
@@ -151,29 +170,16 @@ class Survey(ABC):
     def moved(self, scale: float, turn_rad: float, number: int) -> TlsView | StereoView:
         """Simulate what the first station or pair would see from another place, to find out what a further view adds.
 
-        Parameters
-        ----------
-        scale : New distance from the wall's centre, relative to the present one.
-        turn_rad : Rotation of the sensor about the vertical through the wall's centre, rad.
-        number : Number of the new pose, which tells it from those of the other views.
-
-        Raises
-        ------
-        InputError
-            If too little of the wall is seen from there.
+        scale: new distance from the wall's centre, relative to the present one. turn_rad: rotation of the sensor about the
+        vertical through the wall's centre, rad. number: that of the new pose. Raises InputError if too little of the wall is seen
+        from there.
         """
 
     @abstractmethod
     def repeated(self, number: int) -> tuple[str, TlsView | StereoView]:
-        """Repeat the first view with the sensor set up in another way, to find out what this adds to the survey.
+        """Repeat the first view with the sensor set up in another way. Returns a description in words, and the view.
 
-        Parameters
-        ----------
-        number : Number of the new pose. A laser scanner does not need it, because it keeps its pose.
-
-        Returns
-        -------
-        A description in words, and the view.
+        number: that of the new pose. A laser scanner does not need it, because it keeps its pose.
         """
 
 
@@ -230,27 +236,14 @@ class StereoSurvey(Survey):
         """Simulate the first stereo pair with its cameras rolled by 45 degrees in opposite directions (see `Survey.repeated`)."""
         base = self.views[0].measurement
         pair = base.cameras.rotated("left", 2, np.pi / 4).rotated("right", 2, -np.pi / 4)
-        return "the pair repeated with its cameras rolled by 45 degrees in opposite directions", self.observe(
-            base.changed(cameras=pair), number
-        )
+        view = self.observe(base.changed(cameras=pair), number)
+        return "the pair repeated with its cameras rolled by 45 degrees in opposite directions", view
 
 
 def planned_survey(config: SimulationConfig, sensor: SensorName) -> Survey:
     """Simulate what the scanner stations or cameras of a config would see of the wall, to judge a survey before fieldwork.
 
-    Parameters
-    ----------
-    config : The simulation config, with the wall and the positions of the sensor.
-    sensor : "tls" or "stereo".
-
-    Returns
-    -------
-    Survey : the views of all stations or pairs, the wall's centre, and a function that simulates further views.
-
-    Raises
-    ------
-    InputError
-        If the sensor sees too little of the wall.
+    Raises InputError if the sensor sees too little of the wall.
     """
     site = prepare_site(config, sensor, KeyedRandom(config.seed))
     nothing, mesh, frame, centre = PointCloud(np.empty((0, 3))), site.mesh, site.frame, site.mesh.bounds.mean(axis=0)
@@ -270,25 +263,11 @@ def measured_survey(measurement: Measurement, most: int = _MOST_PULSES) -> Surve
     """Describe from where a measurement saw the wall, to find out which sensor effects it could detect and tell apart.
 
     Each scanner station, or the stereo pair, becomes one view. Only the positions of its points count, not their residuals.
-
-    Parameters
-    ----------
-    measurement : The measurement.
-    most : Largest number of points in the subsample of each view.
-
-    Returns
-    -------
-    Survey : the views of all stations or pairs, the wall's centre, and a function that simulates further views.
-
-    Raises
-    ------
-    InputError
-        If the measurement has no cameras or station.
+    most: largest number of points in the subsample of each view. Raises InputError if the measurement has no cameras or station.
     """
     centre = measurement.reference.bounds.mean(axis=0)
     if isinstance(measurement, StereoMeasurement):
-        seen = stereo_residuals(measurement)
-        pair = StereoView(seen.part(_subsample_rows(seen, most)), int(seen.usable.sum()), 0, measurement)
+        pair = StereoView.subsampled(stereo_residuals(measurement), most, 0, measurement)
         return StereoSurvey((pair,), centre, _pair_observer("medium"))
     if isinstance(measurement, SurfaceMeasurement):
         raise InputError(
@@ -298,31 +277,18 @@ def measured_survey(measurement: Measurement, most: int = _MOST_PULSES) -> Surve
         )
     measurement = measurement.changed(order=None)
     set_ups = [(scan.set_up, one) for scan, rows, one in measurement.each_scan() if len(rows)]
-    found, *others = [(number, one, tls_residuals(one)) for number, one in set_ups or [(0, measurement)]]
-    views = tuple(
-        TlsView(each.part(_subsample_rows(each, most)), int(each.usable.sum()), number, one)
-        for number, one, each in (found, *others)
-    )
-    _, measurement, residuals = found
-    view = views[0]
-    step = float(np.sqrt(np.prod(np.ptp(measurement.cloud.points[:, :2], axis=0)) / max(view.point_count, 1)))
-    reach = float(np.median(residuals.geometry.range_m))
-    steps = {"azimuth_step_rad": step / reach, "zenith_step_rad": step / reach}  # coarser than the scan on near parts
-    scanner = ScannerConfig(zenith_limits_rad=(0.05, 3.09)).model_copy(update=steps)
+    found = [(number, one, tls_residuals(one)) for number, one in set_ups or [(0, measurement)]]
+    views = tuple(TlsView.subsampled(each, most, number, one) for number, one, each in found)
+    _, first, residuals = found[0]
+    step = float(np.sqrt(np.prod(np.ptp(first.cloud.points[:, :2], axis=0)) / max(views[0].point_count, 1)))
+    step_rad = step / float(np.median(residuals.geometry.range_m))  # coarser than the scan on near parts
+    update = {"azimuth_step_rad": step_rad, "zenith_step_rad": step_rad}
+    scanner = ScannerConfig(zenith_limits_rad=(0.05, 3.09)).model_copy(update=update)
     return TlsSurvey(views, centre, _scan_observer(scanner))
 
 
-def _subsample_rows(found: Residuals, most: int) -> NDArray[np.int64]:
-    """Rows of a subsample on smooth parts of the wall."""
-    rows = np.flatnonzero(found.usable)
-    return rows[:: max(len(rows) // most, 1)]
-
-
 def _scan_observer(scanner: ScannerConfig) -> Callable[[TlsMeasurement, int], TlsView]:
-    """Return a function that scans the wall from a measurement's pose.
-
-    The scan covers the whole wall, unless the config has a window.
-    """
+    """Return a function that scans the wall from a measurement's pose: the whole wall, unless the config has a window."""
 
     def observe(base: TlsMeasurement, number: int) -> TlsView:
         world = base.frame.to_world(base.station[0][None])[0], base.frame.rotation.T @ base.station[1]
@@ -338,11 +304,10 @@ def _scan_observer(scanner: ScannerConfig) -> Callable[[TlsMeasurement, int], Tl
         )
         seen = replace(instrument, pattern=subsampled).observe(base.scene, KeyedRandom(0, ("gap", "planned")))
         valid = seen.valid.ravel()
-        power = (
-            None
-            if seen.intensity is None
-            else _with_albedo(np.asarray(seen.intensity.ravel()[valid], dtype=np.float64), base.scene)
-        )
+        power = None if seen.intensity is None else seen.intensity.ravel()[valid].astype(np.float64)
+        if power is not None and base.scene.mesh.vertex_albedo is None:
+            random = KeyedRandom(0, ("gap", "albedo")).generator()
+            power *= np.exp(_ALBEDO_SPREAD * random.standard_normal(len(power)))
         cloud = PointCloud(seen.points.reshape(-1, 3)[valid], power, np.flatnonzero(valid).astype(float))
         measurement = base.changed(cloud=cloud)
         found = tls_residuals(measurement)
@@ -351,14 +316,6 @@ def _scan_observer(scanner: ScannerConfig) -> Callable[[TlsMeasurement, int], Tl
         return TlsView.of(replace(found, geometry=geometry), int(valid.sum()) * stride**2, number, measurement)
 
     return observe
-
-
-def _with_albedo(power: FloatArray, scene: RayCaster) -> FloatArray:
-    """Powers with a random albedo, if the wall has none of its own."""
-    if scene.mesh.vertex_albedo is not None:
-        return power
-    random = KeyedRandom(0, ("gap", "albedo")).generator()
-    return np.asarray(power * np.exp(_ALBEDO_SPREAD * random.standard_normal(len(power))), dtype=np.float64)
 
 
 def _pair_observer(quality: Quality) -> Callable[[StereoMeasurement, int], StereoView]:
