@@ -294,18 +294,20 @@ def predict_disparities(nominal: NominalPair, real: Iterable[CameraPair], geomet
     return _on_host(*[seen(pair) for pair in real])
 
 
-def moved_pair(pair: CameraPair, centre: FloatArray, vector: FloatArray, *, turned: bool) -> CameraPair:
-    """Shift or rotate both cameras of a stereo pair together, as one rigid body.
+def moved_pairs(pair: CameraPair, step: float) -> list[CameraPair]:
+    """Move both cameras of a pair together, as one rigid body, in six ways, to compute derivatives by the pose.
 
-    vector: (3,) shift, m, or, if `turned`, small rotation vector, rad, about the point `centre` (3,), m. All are in the frame of
-    the pair.
+    They are shifted by `step`, m, along x, y and z, and then rotated by `step`, rad, about these axes through the left camera.
     """
-    if not turned:
-        return pair.shifted("both", vector)
-    x, y, z = vector
-    turn = np.eye(3) + np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
-    places = ((camera, centre + turn @ (camera.position - centre)) for camera in (pair.left, pair.right))
-    return CameraPair(*(replace(camera, rotation=turn @ camera.rotation, position=place) for camera, place in places))
+    units, centre = step * np.eye(3), pair.left.position
+
+    def turned(camera: Camera, vector: FloatArray) -> Camera:
+        x, y, z = vector
+        turn = np.eye(3) + np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+        return replace(camera, rotation=turn @ camera.rotation, position=centre + turn @ (camera.position - centre))
+
+    shifted = [pair.shifted("both", unit) for unit in units]
+    return [*shifted, *(CameraPair(turned(pair.left, unit), turned(pair.right, unit)) for unit in units)]
 
 
 def real_pair(effects: tuple[Effect, ...], measurement: StereoMeasurement) -> CameraPair:

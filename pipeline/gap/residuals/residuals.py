@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, fields, replace
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, ClassVar, Protocol, Self, TypeVar
+from typing import Any, ClassVar, Protocol, Self, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,13 +16,10 @@ from scene.geometry.mesh import FloatArray
 from sensors.effects import Effects, catalogue
 from sensors.effects.base import Effect, Sensor
 
-if TYPE_CHECKING:
-    from _typeshed import DataclassInstance
-
 BoolArray = NDArray[np.bool_]
 Rows = BoolArray | NDArray[np.int64] | slice
 """Which of n points are meant: a mask, row numbers or a slice."""
-_Columns = TypeVar("_Columns", bound="DataclassInstance")
+_Columns = TypeVar("_Columns")
 POINT_COLUMNS = ("value", "sigma", "unit_m", "usable", "on_smooth_surface", "pose_jacobian", "wall_xy", "index")
 """Fields of `Residuals` that are arrays with a row for each point."""
 
@@ -51,20 +48,15 @@ class Geometry(Protocol):
         """(n,) measured observable minus that of the reference surface, m or px, with predicted systematic errors still in it."""
 
 
-def _order(values: FloatArray) -> NDArray[np.int32]:
-    """Row numbers that sort the values, ascending; equal values keep their order."""
-    return np.argsort(values, kind="stable").astype(np.int32)
-
-
 def select_rows(columns: _Columns, rows: Rows) -> _Columns:
     """Return a copy of a dataclass of arrays with chosen rows only, to restrict measured quantities to a subset of the points.
 
     columns: its fields are arrays (n, ...), one row for each of n points, or None (which stays None). rows: row numbers, a mask
     (n,) or a slice.
     """
-    values: dict[str, Any] = {column.name: getattr(columns, column.name) for column in fields(columns)}
-    kept = _without_mask(rows)
-    return replace(columns, **{name: _rows_of(value, kept) for name, value in values.items() if value is not None})
+    found: Any = columns
+    kept, values = _without_mask(rows), {column.name: getattr(found, column.name) for column in fields(found)}
+    return replace(found, **{name: _rows_of(value, kept) for name, value in values.items() if value is not None})
 
 
 def _without_mask(rows: Rows) -> NDArray[np.int64] | slice:
@@ -174,7 +166,8 @@ class Residuals(ABC):
     @cached_property
     def sort_orders(self) -> dict[str, NDArray[np.int32]]:
         """For each covariate by name, the (n,) row numbers that sort the points by it, to divide them into bins."""
-        return dict(zip(self.covariates, map_in_threads(_order, self.covariates.values()), strict=True))
+        orders = map_in_threads(lambda x: np.argsort(x, kind="stable").astype(np.int32), self.covariates.values())
+        return dict(zip(self.covariates, orders, strict=True))
 
     def values_at(self, values: FloatArray, index: NDArray[np.int64]) -> FloatArray:
         """Look up values of these residuals' points by row numbers in the measurement, to compare residuals of other points.
@@ -205,20 +198,18 @@ class Residuals(ABC):
         known: (n,) true for the points to replace. other: new residuals of just these points, in the same order. `usable` and
         `on_smooth_surface` stay.
         """
-        names = ("value", "sigma", "unit_m", "pose_jacobian", "wall_xy")
-        columns: dict[str, Any] = {name: _merged(getattr(self, name), getattr(other, name), known) for name in names}
-        columns["covariates"] = {name: _merged(values, other.covariates[name], known) for name, values in self.covariates.items()}
+
+        def merged(mine: dict[str, Any], theirs: dict[str, Any]) -> dict[str, Any]:
+            found = {name: values.copy() for name, values in mine.items() if values is not None}
+            for name, values in found.items():
+                values[known] = theirs[name]
+            return found
+
+        columns = {name: getattr(self, name) for name in ("value", "sigma", "unit_m", "pose_jacobian", "wall_xy")}
+        covariates = merged(self.covariates, other.covariates)
         geometry: Any = self.geometry
-        theirs = vars(other.geometry)
-        merged = {name: _merged(values, theirs[name], known) for name, values in vars(geometry).items() if values is not None}
-        return replace(self, **columns, geometry=replace(geometry, **merged))
-
-
-def _merged(mine: NDArray[Any], theirs: NDArray[Any], known: BoolArray) -> NDArray[Any]:
-    """Return (n, ...) values in which the rows `known` are replaced by `theirs`."""
-    found = mine.copy()
-    found[known] = theirs
-    return found
+        geometry = replace(geometry, **merged(vars(geometry), vars(other.geometry)))
+        return replace(self, **merged(columns, vars(other)), covariates=covariates, geometry=geometry)
 
 
 @dataclass(frozen=True)
@@ -233,8 +224,8 @@ class ExpectedPulses:
     """
 
     lost: BoolArray
-    covariates: dict[str, FloatArray] = field(default_factory=dict)
-    wall_xy: FloatArray = field(default_factory=lambda: np.empty((0, 2)))
+    covariates: dict[str, FloatArray]
+    wall_xy: FloatArray
 
 
 def range_derivative(normal: FloatArray, direction: FloatArray, moved: FloatArray, distance: FloatArray) -> FloatArray:

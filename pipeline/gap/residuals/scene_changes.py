@@ -40,8 +40,8 @@ from pipeline.gap.thresholds import thresholds
 from scene.geometry.frame import WallFrame
 from scene.geometry.mesh import FloatArray
 
-Pairs = tuple[NDArray[np.int64], NDArray[np.int64]]
-"""Rows of the first and of the second point of pairs of neighbours."""
+Pairs = NDArray[np.int64]
+"""Row numbers (2, k) of the two points of k pairs of neighbours."""
 
 _LEVELS = (2.5, 4.0, 8.0)
 """Levels in sigmas above which points form components."""
@@ -185,16 +185,15 @@ def _components(z: FloatArray, faint: FloatArray, view: SensorView, eligible: Bo
     """
     exceeds = np.abs(faint) > thresholds().changes.faint_sigmas
     side = np.where(exceeds, np.sign(faint), np.sign(z)) * (exceeds | (np.abs(z) > _LEVELS[0]))
-    first, second = view.neighbour_pairs(np.flatnonzero(side))
-    together = side[first] * side[second] > 0
-    pairs, size = (first[together], second[together]), np.abs(z)
+    pairs, size = view.neighbour_pairs(np.flatnonzero(side)), np.abs(z)
+    pairs = pairs[:, side[pairs[0]] * side[pairs[1]] > 0]
     least = max(thresholds().points.registration_outlier_sigmas, _correlated_sigmas(z, view, eligible))
     core = _faint_cores(faint, exceeds, pairs, eligible)
     for sign, level, ratio in product((1.0, -1.0), _LEVELS, _RATIOS):
         core |= _significant(sign * z, level, ratio, pairs, eligible, least)
     whole = _extended(core, size, pairs, eligible)
     label = _compact(_connected(whole, pairs), int(eligible.sum()))
-    inside = _select_pairs(pairs, whole[pairs[0]] & whole[pairs[1]])
+    inside = pairs[:, whole[pairs].all(axis=0)]
     most = np.zeros(len(z))
     for one, other in (inside, inside[::-1]):
         np.maximum.at(most, one, size[other])
@@ -212,8 +211,8 @@ def _faint_cores(faint: FloatArray, exceeds: BoolArray, pairs: Pairs, eligible: 
 
 def _agreeing(pairs: Pairs, size: FloatArray, ratio: float) -> Pairs:
     """The pairs whose standardised residuals (n,) agree."""
-    one, other = size[pairs[0]], size[pairs[1]]
-    return _select_pairs(pairs, np.maximum(one, other) <= _agreement_limit(np.minimum(one, other), ratio))
+    sizes = size[pairs]
+    return pairs[:, sizes.max(axis=0) <= _agreement_limit(sizes.min(axis=0), ratio)]
 
 
 def _agreement_limit(size: FloatArray, ratio: float) -> FloatArray:
@@ -296,17 +295,12 @@ def _connected(chosen: BoolArray, pairs: Pairs) -> NDArray[np.int64]:
     rows = np.flatnonzero(chosen)
     number = np.full(len(chosen), -1)
     number[rows] = np.arange(len(rows))
-    one, other = (number[each] for each in _select_pairs(pairs, chosen[pairs[0]] & chosen[pairs[1]]))
+    one, other = number[pairs[:, chosen[pairs].all(axis=0)]]
     graph = coo_array((np.ones(len(one), dtype=np.int8), (one, other)), shape=(len(rows), len(rows)))
     label = np.full(len(chosen), -1)
     if len(rows):
         label[rows] = connected_components(graph, directed=False)[1]
     return label
-
-
-def _select_pairs(pairs: Pairs, which: BoolArray) -> Pairs:
-    """Some of the pairs."""
-    return pairs[0][which], pairs[1][which]
 
 
 def _compact(label: NDArray[np.int64], points: int) -> NDArray[np.int64]:

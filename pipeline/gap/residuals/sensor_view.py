@@ -133,16 +133,15 @@ class SensorView:
         groups = [np.flatnonzero(self.epoch == number) for number in np.unique(self.epoch)]
         return [(rows, cKDTree(self.scaled_coordinates[rows])) for rows in groups]
 
-    def neighbour_pairs(self, rows: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    def neighbour_pairs(self, rows: NDArray[np.int64]) -> NDArray[np.int64]:
         """Pair points with their neighbours in the sensor's field of view, to find connected groups of points.
 
         Neighbours are the eight nearest points of the same epoch (repetition of the measurement) within three point spacings, and
         the point at the same place in the next epoch.
 
-        rows: row numbers of the points whose neighbours are wanted. Returns the row numbers of the first (k,) and of the second
-        point (k,) of k pairs.
+        rows: row numbers of the points whose neighbours are wanted. Returns the row numbers of both points of k pairs, (2, k).
         """
-        pairs = [np.empty((2, 0), dtype=np.int64)]
+        found = [np.empty((2, 0), dtype=np.int64)]
         wanted = np.zeros(len(self.coordinates), dtype=bool)
         wanted[rows] = True
         for number, (group, _) in enumerate(self._trees):
@@ -151,9 +150,9 @@ class SensorView:
             for (others, tree), (farthest, nearest) in zip(self._trees[number : number + 2], searches, strict=False):
                 distance, position = tree.query(self.scaled_coordinates[own], nearest, distance_upper_bound=farthest)
                 hit = np.isfinite(distance)
-                pairs.append(np.stack([np.repeat(own, hit.sum(axis=1)), others[position[hit]]]))
-        first, second = np.concatenate(pairs, axis=1)
-        return first[first != second], second[first != second]
+                found.append(np.stack([np.repeat(own, hit.sum(axis=1)), others[position[hit]]]))
+        pairs = np.concatenate(found, axis=1)
+        return pairs[:, pairs[0] != pairs[1]]
 
     def neighbour_median(self, z: FloatArray) -> FloatArray:
         """Return the median (n,) of values z (n,) over each point and its eight nearest neighbours in the field of view.
@@ -170,10 +169,9 @@ class SensorView:
     @cached_property
     def _rings(self) -> list[tuple[NDArray[np.int64], NDArray[np.int32]]]:
         """For each epoch the rows of its points, and for each point itself and its neighbours, numbered among those rows."""
-        counts = [min(NEIGHBOURS + 1, len(group)) for group, _ in self._trees]
         return [
-            (group, tree.query(self.scaled_coordinates[group], count, workers=-1)[1].astype(np.int32))
-            for (group, tree), count in zip(self._trees, counts, strict=True)
+            (group, tree.query(self.scaled_coordinates[group], min(NEIGHBOURS + 1, len(group)), workers=-1)[1].astype(np.int32))
+            for group, tree in self._trees
         ]
 
     def near(self, rows: NDArray[np.int64], spacings: float) -> NDArray[np.bool_]:

@@ -20,7 +20,7 @@ from pipeline.gap.residuals.nominal_pair import (
     NominalPair,
     PixelGeometry,
     is_hidden,
-    moved_pair,
+    moved_pairs,
     pixel_rays,
     predict_disparities,
     project,
@@ -138,7 +138,7 @@ def stereo_residuals(measurement: StereoMeasurement) -> StereoResiduals:
         covariates=covariates,
         index=np.arange(len(u)),
         geometry=geometry,
-        correlated_noise=GridCorrelatedNoise.of(model, np.stack([u, v], axis=1)),
+        correlated_noise=GridCorrelatedNoise(pixels=np.stack([u, v], axis=1)).with_effects(model.matching_noise),
         notes=(*measurement.notes, *_notes(_has_pixels(measurement), u, v, cell_px)),
     )
     return whole if hit.all() else whole.part(hit)
@@ -258,11 +258,8 @@ def _edge_px(nominal: NominalPair, left: Camera, scene: RayCaster, geometry: Pix
 
 def _pose_jacobian(nominal: NominalPair, geometry: PixelGeometry) -> FloatArray:
     """(n, 6) derivatives of the disparity by a shift (m) and a rotation (rad) of both cameras about the left one, wall frame."""
-    centre, step = nominal.pair.left.position, 1e-4
-    units = step * np.eye(3)
-    moved = [moved_pair(nominal.pair, centre, unit, turned=turned) for turned in (False, True) for unit in units]
-    base, *columns = predict_disparities(nominal, [nominal.pair, *moved], geometry)
-    return np.stack([(column - base) / step for column in columns], axis=1)
+    base, *columns = predict_disparities(nominal, [nominal.pair, *moved_pairs(nominal.pair, _NUDGE)], geometry)
+    return np.stack([(column - base) / _NUDGE for column in columns], axis=1)
 
 
 def _systematic_error(model: StereoModel, geometry: PixelGeometry) -> FloatArray:

@@ -111,37 +111,39 @@ def surface_residuals(measurement: SurfaceMeasurement) -> SurfaceResiduals:
     points, model = measurement.cloud.points, measurement.model
     spacing = point_spacing_m(points)
     geometry, triangle, across = _hits_along_normals(measurement, points)
+    index = np.flatnonzero(np.isfinite(geometry.departure))
+    geometry, triangle, across = geometry.part(index), triangle[index], across[index]
     sigma = predicted_sigma(model, geometry)
-    mean = sum((effect.mean(geometry) for effect in model.of_points()), np.zeros(len(points)))
-    hit = np.isfinite(geometry.departure)
+    mean = sum((effect.mean(geometry) for effect in model.of_points()), np.zeros(len(index)))
     bend = _bend(measurement, geometry.point, triangle, geometry.normal, spacing)
-    even = hit & (bend < np.maximum(_EDGE_SIGMAS * sigma, _EDGE_SLOPE * spacing))
-    even &= _rim_distance(measurement, geometry.point) > _FROM_RIM * spacing
-    whole = SurfaceResiduals(
+    even = bend < np.maximum(_EDGE_SIGMAS * sigma, _EDGE_SLOPE * spacing)
+    if len(rim := measurement.shape.rim):
+        distance = cKDTree(measurement.reference.vertices[rim]).query(geometry.point, workers=-1)[0]
+        even &= distance > _FROM_RIM * spacing
+    return SurfaceResiduals(
         value=geometry.departure - mean,
         sigma=sigma,
-        unit_m=np.ones(len(points)),
-        usable=even & measurement.stable,
+        unit_m=np.ones(len(index)),
+        usable=even & measurement.stable[index],
         on_smooth_surface=even,
         pose_jacobian=-datum_columns(geometry.point - measurement.centre, triangle) @ measurement.datum / across[:, None],
         wall_xy=geometry.point[:, :2],
-        covariates=_varying_covariates(geometry, hit, measurement),
-        index=np.arange(len(points)),
+        covariates=_varying_covariates(geometry, measurement),
+        index=index,
         geometry=geometry,
         datum=measurement.datum,
         correlated_noise=_correlated_noise(model, geometry.point[:, :2], spacing),
         notes=(*measurement.notes, NO_CAMERAS, *(() if measurement.datum[6].any() else (NO_SCALE,))),
     )
-    return whole.part(hit)
 
 
-def _varying_covariates(geometry: SurfaceGeometry, hit: BoolArray, measurement: SurfaceMeasurement) -> dict[str, FloatArray]:
+def _varying_covariates(geometry: SurfaceGeometry, measurement: SurfaceMeasurement) -> dict[str, FloatArray]:
     """The covariates that vary by more than rounding errors."""
     extent = float(np.linalg.norm(np.ptp(measurement.reference.bounds, axis=0)))
     return {
         name: values
         for name, values in geometry.covariates.items()
-        if name in SurfaceResiduals.position_covariates or (hit.any() and float(np.ptp(values[hit])) > _ROUNDING * extent)
+        if name in SurfaceResiduals.position_covariates or (len(values) and float(np.ptp(values)) > _ROUNDING * extent)
     }
 
 
@@ -185,29 +187,15 @@ def _bend(
     measurement: SurfaceMeasurement, point: FloatArray, triangle: FloatArray, normal: FloatArray, spacing: float
 ) -> FloatArray:
     """(n,) largest deviation of the reference from the hit triangle's plane at four places one point spacing away, m."""
-    known = np.isfinite(point).all(axis=1)
-    bend = np.full(len(point), np.inf)
-    at, plane, direction = point[known], triangle[known], normal[known]
-    first = np.cross(direction, np.where(np.abs(direction[:, :1]) < 0.9, [[1.0, 0.0, 0.0]], [[0.0, 1.0, 0.0]]))
+    first = np.cross(normal, np.where(np.abs(normal[:, :1]) < 0.9, [[1.0, 0.0, 0.0]], [[0.0, 1.0, 0.0]]))
     first /= np.linalg.norm(first, axis=1, keepdims=True)
-    second, found = np.cross(direction, first), np.zeros(len(at))
+    second, bend = np.cross(normal, first), np.zeros(len(point))
     for aside in (first, -first, second, -second):
-        start = at + spacing * aside + 5 * spacing * direction
-        distance = measurement.scene.cast(start, -direction)[0]
-        flat = np.einsum("ni,ni->n", plane, start - at) / np.einsum("ni,ni->n", plane, direction)
-        found = np.maximum(found, np.nan_to_num(np.abs(distance - flat), nan=np.inf))
-    bend[known] = found
+        start = point + spacing * aside + 5 * spacing * normal
+        distance = measurement.scene.cast(start, -normal)[0]
+        flat = np.einsum("ni,ni->n", triangle, start - point) / np.einsum("ni,ni->n", triangle, normal)
+        bend = np.maximum(bend, np.nan_to_num(np.abs(distance - flat), nan=np.inf))
     return bend
-
-
-def _rim_distance(measurement: SurfaceMeasurement, point: FloatArray) -> FloatArray:
-    """(n,) distance from the reference's open border, m; infinite if it has none."""
-    rim = measurement.shape.rim
-    known = np.isfinite(point).all(axis=1)
-    distance = np.where(known, np.inf, 0.0)
-    if len(rim):
-        distance[known] = cKDTree(measurement.reference.vertices[rim]).query(point[known], workers=-1)[0]
-    return distance
 
 
 def _correlated_noise(model: StereoModel, at: FloatArray, spacing: float) -> GridCorrelatedNoise:

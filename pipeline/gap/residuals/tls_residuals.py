@@ -251,9 +251,7 @@ def _shares_of_duration(time: FloatArray, epochs: NDArray[np.int64]) -> FloatArr
 def _scan_lines(pattern: ScanPattern | None, azimuth: FloatArray) -> FloatArray | None:
     """(n,) scan line of each azimuth; None if the azimuths lie on no raster."""
     if pattern is not None:
-        start, _, step = pattern.azimuth_rad
-        turn = 2 * np.pi * np.round((azimuth.mean() - start - (pattern.azimuth_rad[1] - start) / 2) / (2 * np.pi))
-        return np.asarray(np.rint((azimuth - turn - start) / step), dtype=np.float64)
+        return _line_number(pattern, azimuth)
     gaps = np.diff(np.sort(azimuth))
     wide = gaps[gaps > _SHORTEST_STEP_RAD]
     if len(wide) < 10 or len(wide) > 0.2 * len(azimuth):
@@ -334,14 +332,17 @@ def pulse_number(pattern: ScanPattern, azimuth: FloatArray, zenith: FloatArray) 
     azimuth, zenith: (n,) recorded directions, rad, scanner frame. Returns the numbers (n,) of the pulses, counted from 0, scan
     line (azimuth) by scan line.
     """
-    sweeps = _sweeps(pattern)
-    turn = 2 * np.pi * np.round((azimuth.mean() - sweeps[0].mean()) / (2 * np.pi))
-    columns = (
-        np.rint((azimuth - turn - sweeps[0][0]) / pattern.azimuth_rad[2]),
-        np.rint((zenith - sweeps[1][0]) / pattern.zenith_rad[2]),
-    )
+    sweeps, (start, _, step) = _sweeps(pattern), pattern.zenith_rad
+    columns = _line_number(pattern, azimuth), np.rint((zenith - start) / step)
     line, pulse = (np.clip(column, 0, len(sweep) - 1).astype(np.int64) for column, sweep in zip(columns, sweeps, strict=True))
     return np.asarray(line * len(sweeps[1]) + pulse)
+
+
+def _line_number(pattern: ScanPattern, azimuth: FloatArray) -> FloatArray:
+    """(n,) number of the scan line that is nearest to each azimuth, which may differ by full turns from those of the pattern."""
+    start, stop, step = pattern.azimuth_rad
+    turn = 2 * np.pi * np.round((azimuth.mean() - start - (stop - start) / 2) / (2 * np.pi))
+    return np.asarray(np.rint((azimuth - turn - start) / step), dtype=np.float64)
 
 
 def _returned(pattern: ScanPattern, geometry: RayGeometry) -> BoolArray:

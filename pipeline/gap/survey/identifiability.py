@@ -242,9 +242,10 @@ def _extended(survey: Survey) -> list[tuple[str, tuple[SurveyView, ...], KnownPo
     Measurements that would see too little of the wall are left out.
     """
     number = max(view.station for view in survey.views) + 1
+    place = "station" if survey.sensor == "tls" else "pair of exposures"
     wanted: list[Callable[[], tuple[str, SurveyView]]] = [
-        lambda: (f"a second {survey.place} at half the range", survey.moved(0.5, 0.0, number)),
-        lambda: (f"a second {survey.place} at the same range, 40 degrees aside", survey.moved(1.0, np.radians(40.0), number)),
+        lambda: (f"a second {place} at half the range", survey.moved(0.5, 0.0, number)),
+        lambda: (f"a second {place} at the same range, 40 degrees aside", survey.moved(1.0, np.radians(40.0), number)),
         lambda: survey.repeated(number),
     ]
     found: list[tuple[str, tuple[SurveyView, ...], KnownPoints | None]] = []

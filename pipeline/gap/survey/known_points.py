@@ -11,10 +11,11 @@ from typing import Any
 
 import numpy as np
 
+from pipeline.formats.measurements.measurement import StereoMeasurement, TlsMeasurement
 from pipeline.gap.mean.candidates import Candidate
-from pipeline.gap.residuals.nominal_pair import NominalPair, moved_pair, project, real_pair
+from pipeline.gap.residuals.nominal_pair import NominalPair, moved_pairs, project, real_pair
 from pipeline.gap.residuals.ray_hits import RayGeometry
-from pipeline.gap.survey.survey_views import StereoView, TlsView
+from pipeline.gap.survey.survey_views import SurveyView
 from scene.geometry.mesh import FloatArray
 from sensors.cameras.camera import CameraPair
 from sensors.effects import effect_of
@@ -31,8 +32,8 @@ _CHECK_SIGMA_PX = 0.1
 """Standard deviation of an image coordinate of a check point, px."""
 _CHECK_DEPTHS = (0.7, 1.0)
 """Depths of the check points relative to that of the wall, alternating."""
-_STEP = 0.01
-"""Step of the finite differences, relative to a parameter's typical value."""
+_STEP, _NUDGE = 0.01, 1e-4
+"""Steps of the finite differences: relative to a parameter's typical value, and of a pose, m and rad."""
 
 
 @dataclass(frozen=True)
@@ -57,21 +58,22 @@ class KnownPoints:
     columns: Callable[[list[Candidate]], FloatArray]
 
 
-def known_points(view: TlsView | StereoView) -> KnownPoints:
+def known_points(view: SurveyView) -> KnownPoints:
     """Return observations of points with known positions that a survey could add, to find out how much they would help.
 
     They are twelve targets around the first station of a laser scanner, or 24 check points in front of the first stereo pair.
     """
-    return _targets(view) if isinstance(view, TlsView) else _check_points(view)
+    base = view.measurement
+    return _targets(view, base.station[1]) if isinstance(base, TlsMeasurement) else _check_points(view, base)
 
 
-def _targets(view: TlsView) -> KnownPoints:
-    """Twelve targets around the station.
+def _targets(view: SurveyView, turn: FloatArray) -> KnownPoints:
+    """Twelve targets around the station, which has the rotation `turn` (3, 3) to the wall frame.
 
     A point that is known in three dimensions gives as much information as three orthogonal planes through it. They are equally
     inclined to the ray here, so the signatures of ranges can be used.
     """
-    g = view.residuals.geometry
+    g: Any = view.residuals.geometry
     azimuth = float(g.azimuth.mean()) + 2 * np.pi * np.arange(_TARGETS) / _TARGETS
     zenith = np.pi / 2 - np.tile([-0.25, 0.1, 0.45], _TARGETS)[:_TARGETS]
     distance = float(np.median(g.range_m)) * np.tile([0.25, 0.5, 0.75, 1.0], _TARGETS)[:_TARGETS]
@@ -80,7 +82,6 @@ def _targets(view: TlsView) -> KnownPoints:
     # components of the planes' normals across the ray, relative to that along it
     across, along = np.sqrt(2.0) * np.cos(angle), np.sqrt(2.0) * np.sin(angle)
     ray, right, down = polar_axes(azimuth, zenith)
-    turn = view.measurement.station[1]
     normal = np.einsum("ij,nj->ni", turn, ray + across[:, None] * right + along[:, None] * down)
     ray = np.einsum("ij,nj->ni", turn, ray)
     pose = np.concatenate([-normal, -distance[:, None] * np.cross(ray, normal)], axis=1)
@@ -104,9 +105,9 @@ def _targets(view: TlsView) -> KnownPoints:
     return KnownPoints(title, pose, sigma, there.signature_columns)
 
 
-def _check_points(view: StereoView) -> KnownPoints:
+def _check_points(view: SurveyView, measurement: StereoMeasurement) -> KnownPoints:
     """A grid of points at two depths in front of the pair, whose columns and rows are measured in both images."""
-    nominal = NominalPair.of(view.measurement)
+    nominal = NominalPair.of(measurement)
     left, depth = nominal.pair.left, float(np.median(view.residuals.covariates["depth"]))
     share = [(np.arange(count) + 0.5) / count for count in (_CHECK_COLUMNS, _CHECK_ROWS)]
     u, v = (each.ravel() for each in np.meshgrid(left.width * share[0], left.height * share[1]))
@@ -122,7 +123,7 @@ def _check_points(view: StereoView) -> KnownPoints:
     def column(effect: type[Effect], camera: str, key: str) -> FloatArray:
         extra: Any = effect.model_fields[key].json_schema_extra
         step = _STEP * float(extra["typical"] or 1e-3)
-        real = real_pair((effect(**{"camera": camera, key: step}),), view.measurement)
+        real = real_pair((effect(**{"camera": camera, key: step}),), measurement)
         return np.asarray((seen(real) - base) / step)
 
     def columns(candidate: Candidate) -> FloatArray:
@@ -134,9 +135,7 @@ def _check_points(view: StereoView) -> KnownPoints:
         # other effects arise in area matching, which is not used for targets
         return np.zeros((len(base), candidate.columns.shape[1]))
 
-    units = 1e-4 * np.eye(3)
-    moved = [moved_pair(nominal.pair, left.position, unit, turned=turned) for turned in (False, True) for unit in units]
-    pose = np.stack([(seen(pair) - base) / 1e-4 for pair in moved], axis=1)
+    pose = np.stack([(seen(pair) - base) / _NUDGE for pair in moved_pairs(nominal.pair, _NUDGE)], axis=1)
     title = f"{_CHECK_ROWS * _CHECK_COLUMNS} check points across the frame, known to {_CHECK_SIGMA_PX:g} px"
     return KnownPoints(
         title, pose, np.full(len(base), _CHECK_SIGMA_PX), lambda wanted: np.concatenate([*map(columns, wanted)], axis=1)

@@ -6,11 +6,10 @@ is kept with it. Further stations, a second face and further pairs are added in 
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any, ClassVar, Self
+from typing import Any
 
 import numpy as np
 
@@ -20,13 +19,14 @@ from pipeline.formats.point_cloud import PointCloud
 from pipeline.gap.mean.candidates import Candidate
 from pipeline.gap.mean.signatures import systematic_candidates
 from pipeline.gap.residuals.residuals import Residuals
-from pipeline.gap.residuals.stereo_residuals import StereoResiduals, stereo_residuals
-from pipeline.gap.residuals.tls_residuals import TlsResiduals, tls_residuals
+from pipeline.gap.residuals.stereo_residuals import stereo_residuals
+from pipeline.gap.residuals.tls_residuals import tls_residuals
 from pipeline.run.site import prepare_site
 from scene.common.errors import InputError
 from scene.common.keyed_random import KeyedRandom
 from scene.geometry.mesh import FloatArray
 from sensors.cameras.camera import Camera, CameraPair
+from sensors.effects.base import Sensor
 from sensors.laser.tls import LaserScanner, ScannerConfig
 from sensors.models.sensor_model import StereoModel, TlsModel, TlsNoise
 from sensors.stereo.exchanged import pair_of
@@ -64,10 +64,10 @@ class SurveyView:
     residuals: Residuals
     point_count: int
     station: int
-    measurement: Measurement
+    measurement: TlsMeasurement | StereoMeasurement
 
     @classmethod
-    def of(cls, found: Residuals, whole: int, number: int, measurement: Measurement) -> Self:
+    def of(cls, found: Residuals, whole: int, number: int, measurement: TlsMeasurement | StereoMeasurement) -> SurveyView:
         """Make the view of one scanner station or stereo pair. Of a subsample of its points, those on smooth parts are kept.
 
         Parameters
@@ -91,7 +91,7 @@ class SurveyView:
         return cls(found.part(smooth), int(whole * len(smooth) / len(found)), number, measurement)
 
     @classmethod
-    def subsampled(cls, found: Residuals, most: int, number: int, measurement: Measurement) -> Self:
+    def subsampled(cls, found: Residuals, most: int, number: int, measurement: TlsMeasurement | StereoMeasurement) -> SurveyView:
         """Make the view of a station or pair from all its points: about `most` points on smooth parts of the wall are kept."""
         smooth = np.flatnonzero(found.usable)
         return cls(found.part(smooth[:: max(len(smooth) // most, 1)]), len(smooth), number, measurement)
@@ -132,23 +132,7 @@ def _key(candidate: Candidate) -> tuple[Any, ...]:
 
 
 @dataclass(frozen=True)
-class TlsView(SurveyView):
-    """What one scanner station, real or planned, sees of the wall (see `SurveyView`)."""
-
-    residuals: TlsResiduals
-    measurement: TlsMeasurement
-
-
-@dataclass(frozen=True)
-class StereoView(SurveyView):
-    """What one stereo pair, real or planned, sees of the wall (see `SurveyView`)."""
-
-    residuals: StereoResiduals
-    measurement: StereoMeasurement
-
-
-@dataclass(frozen=True)
-class Survey(ABC):
+class Survey:
     """A survey of one wall by one sensor, from which surveys with additional views can be made.
 
     Attributes
@@ -157,72 +141,29 @@ class Survey(ABC):
     centre : (3,) centre of the wall, wall frame, m.
     observe : Function that simulates a further view. Its arguments are a measurement with the pose of the station or the cameras
         of the pair, and the number to give to this pose.
-    sensor, place : "tls" or "stereo", and what a place of observation is called in texts.
     """
 
-    views: tuple[TlsView | StereoView, ...]
+    views: tuple[SurveyView, ...]
     centre: FloatArray
-    observe: Callable[[Any, int], TlsView | StereoView]
-    sensor: ClassVar[SensorName]
-    place: ClassVar[str]
+    observe: Callable[[Any, int], SurveyView]
 
-    @abstractmethod
-    def moved(self, scale: float, turn_rad: float, number: int) -> TlsView | StereoView:
+    @property
+    def sensor(self) -> Sensor:
+        """Kind of sensor, "tls" or "stereo"."""
+        return self.views[0].residuals.sensor
+
+    def moved(self, scale: float, turn_rad: float, number: int) -> SurveyView:
         """Simulate what the first station or pair would see from another place, to find out what a further view adds.
 
         scale: new distance from the wall's centre, relative to the present one. turn_rad: rotation of the sensor about the
         vertical through the wall's centre, rad. number: that of the new pose. Raises InputError if too little of the wall is seen
         from there.
         """
-
-    @abstractmethod
-    def repeated(self, number: int) -> tuple[str, TlsView | StereoView]:
-        """Repeat the first view with the sensor set up in another way. Returns a description in words, and the view.
-
-        number: that of the new pose. A laser scanner does not need it, because it keeps its pose.
-        """
-
-
-@dataclass(frozen=True)
-class TlsSurvey(Survey):
-    """A survey of one wall by laser scans, from which surveys with additional scans can be made."""
-
-    views: tuple[TlsView, ...]
-    observe: Callable[[TlsMeasurement, int], TlsView]
-    sensor = "tls"
-    place = "station"
-
-    def moved(self, scale: float, turn_rad: float, number: int) -> TlsView:
-        """Simulate a scan from another place (see `Survey.moved`)."""
         base = self.views[0].measurement
         turn = _about_vertical(base, turn_rad)
-        position = self.centre + scale * turn @ (base.station[0] - self.centre)
-        return self.observe(base.changed(station=(position, turn @ base.station[1])), number)
-
-    def repeated(self, number: int) -> tuple[str, TlsView]:
-        """Repeat the first station's scan from the same pose in the second face of the instrument (see `Survey.repeated`).
-
-        In the second face, azimuths are larger by pi and zenith angles z become 2 pi - z.
-        """
-        first = self.views[0]
-        g = first.residuals.geometry
-        turned = replace(g, azimuth=g.azimuth + np.pi, zenith=2 * np.pi - g.zenith, by_zenith=-g.by_zenith)
-        return "the scan repeated in the second face", replace(first, residuals=replace(first.residuals, geometry=turned))
-
-
-@dataclass(frozen=True)
-class StereoSurvey(Survey):
-    """A survey of one wall by stereo pairs, from which surveys with additional pairs can be made."""
-
-    views: tuple[StereoView, ...]
-    observe: Callable[[StereoMeasurement, int], StereoView]
-    sensor = "stereo"
-    place = "pair of exposures"
-
-    def moved(self, scale: float, turn_rad: float, number: int) -> StereoView:
-        """Simulate exposures of the first pair from another place (see `Survey.moved`)."""
-        base = self.views[0].measurement
-        turn = _about_vertical(base, turn_rad)
+        if isinstance(base, TlsMeasurement):
+            position = self.centre + scale * turn @ (base.station[0] - self.centre)
+            return self.observe(base.changed(station=(position, turn @ base.station[1])), number)
         world, middle = base.frame.rotation.T @ turn @ base.frame.rotation, base.frame.to_world(self.centre[None])[0]
 
         def place(camera: Camera) -> Camera:
@@ -232,12 +173,20 @@ class StereoSurvey(Survey):
         pair = CameraPair(place(base.cameras.left), place(base.cameras.right))
         return self.observe(base.changed(cameras=pair), number)
 
-    def repeated(self, number: int) -> tuple[str, StereoView]:
-        """Simulate the first stereo pair with its cameras rolled by 45 degrees in opposite directions (see `Survey.repeated`)."""
-        base = self.views[0].measurement
-        pair = base.cameras.rotated("left", 2, np.pi / 4).rotated("right", 2, -np.pi / 4)
-        view = self.observe(base.changed(cameras=pair), number)
-        return "the pair repeated with its cameras rolled by 45 degrees in opposite directions", view
+    def repeated(self, number: int) -> tuple[str, SurveyView]:
+        """Repeat the first view with the sensor set up in another way. Returns a description in words, and the view.
+
+        A laser scanner scans from the same pose in its second face, in which azimuths are larger by pi and zenith angles z become
+        2 pi - z. The cameras of a pair are rolled by 45 degrees in opposite directions; their new pose gets the given number.
+        """
+        first = self.views[0]
+        if isinstance(first.measurement, StereoMeasurement):
+            pair = first.measurement.cameras.rotated("left", 2, np.pi / 4).rotated("right", 2, -np.pi / 4)
+            view = self.observe(first.measurement.changed(cameras=pair), number)
+            return "the pair repeated with its cameras rolled by 45 degrees in opposite directions", view
+        g: Any = first.residuals.geometry
+        turned = replace(g, azimuth=g.azimuth + np.pi, zenith=2 * np.pi - g.zenith, by_zenith=-g.by_zenith)
+        return "the scan repeated in the second face", replace(first, residuals=replace(first.residuals, geometry=turned))
 
 
 def planned_survey(config: SimulationConfig, sensor: SensorName) -> Survey:
@@ -251,12 +200,12 @@ def planned_survey(config: SimulationConfig, sensor: SensorName) -> Survey:
         model, cameras = config.stereo_model(), pair_of(site.sensor).cameras
         pair = StereoMeasurement(cloud=nothing, reference=mesh, frame=frame, model=model, cameras=cameras)
         expose = _pair_observer(config.depth_map)
-        return StereoSurvey((expose(pair, 0),), centre, expose)
+        return Survey((expose(pair, 0),), centre, expose)
     poses = [(scanner.position, scanner.rotation) for scanner in (site.sensor, *site.further_stations)]
     base = TlsMeasurement(cloud=nothing, reference=mesh, frame=frame, model=config.tls_model(), station=poses[0])
     observe = _scan_observer(config.scanner)
     views = tuple(observe(base.changed(station=pose), number) for number, pose in enumerate(poses))
-    return TlsSurvey(views, centre, observe)
+    return Survey(views, centre, observe)
 
 
 def measured_survey(measurement: Measurement, most: int = _MOST_PULSES) -> Survey:
@@ -267,8 +216,8 @@ def measured_survey(measurement: Measurement, most: int = _MOST_PULSES) -> Surve
     """
     centre = measurement.reference.bounds.mean(axis=0)
     if isinstance(measurement, StereoMeasurement):
-        pair = StereoView.subsampled(stereo_residuals(measurement), most, 0, measurement)
-        return StereoSurvey((pair,), centre, _pair_observer("medium"))
+        pair = SurveyView.subsampled(stereo_residuals(measurement), most, 0, measurement)
+        return Survey((pair,), centre, _pair_observer("medium"))
     if isinstance(measurement, SurfaceMeasurement):
         raise InputError(
             "the measurement has no cameras, so no effect can be analysed",
@@ -278,19 +227,19 @@ def measured_survey(measurement: Measurement, most: int = _MOST_PULSES) -> Surve
     measurement = measurement.changed(order=None)
     set_ups = [(scan.set_up, one) for scan, rows, one in measurement.each_scan() if len(rows)]
     found = [(number, one, tls_residuals(one)) for number, one in set_ups or [(0, measurement)]]
-    views = tuple(TlsView.subsampled(each, most, number, one) for number, one, each in found)
+    views = tuple(SurveyView.subsampled(each, most, number, one) for number, one, each in found)
     _, first, residuals = found[0]
     step = float(np.sqrt(np.prod(np.ptp(first.cloud.points[:, :2], axis=0)) / max(views[0].point_count, 1)))
     step_rad = step / float(np.median(residuals.geometry.range_m))  # coarser than the scan on near parts
     update = {"azimuth_step_rad": step_rad, "zenith_step_rad": step_rad}
     scanner = ScannerConfig(zenith_limits_rad=(0.05, 3.09)).model_copy(update=update)
-    return TlsSurvey(views, centre, _scan_observer(scanner))
+    return Survey(views, centre, _scan_observer(scanner))
 
 
-def _scan_observer(scanner: ScannerConfig) -> Callable[[TlsMeasurement, int], TlsView]:
+def _scan_observer(scanner: ScannerConfig) -> Callable[[TlsMeasurement, int], SurveyView]:
     """Return a function that scans the wall from a measurement's pose: the whole wall, unless the config has a window."""
 
-    def observe(base: TlsMeasurement, number: int) -> TlsView:
+    def observe(base: TlsMeasurement, number: int) -> SurveyView:
         world = base.frame.to_world(base.station[0][None])[0], base.frame.rotation.T @ base.station[1]
         instrument = LaserScanner.aimed(world, base.frame, base.reference.vertices, scanner, _QUIET_TLS)
         pattern = instrument.pattern
@@ -313,15 +262,15 @@ def _scan_observer(scanner: ScannerConfig) -> Callable[[TlsMeasurement, int], Tl
         found = tls_residuals(measurement)
         lines = found.geometry.line
         geometry = found.geometry if lines is None else replace(found.geometry, line=stride * lines)
-        return TlsView.of(replace(found, geometry=geometry), int(valid.sum()) * stride**2, number, measurement)
+        return SurveyView.of(replace(found, geometry=geometry), int(valid.sum()) * stride**2, number, measurement)
 
     return observe
 
 
-def _pair_observer(quality: Quality) -> Callable[[StereoMeasurement, int], StereoView]:
+def _pair_observer(quality: Quality) -> Callable[[StereoMeasurement, int], SurveyView]:
     """Return a function that observes the wall with a measurement's cameras, at the coarsest depth map."""
 
-    def observe(base: StereoMeasurement, number: int) -> StereoView:
+    def observe(base: StereoMeasurement, number: int) -> SurveyView:
         pair = StereoPair(base.cameras, base.frame, _QUIET_STEREO, "low")
         points = pair.observe(base.scene, KeyedRandom(0, ("gap", "planned"))).points
         step = REDUCTION["low"]
@@ -333,7 +282,7 @@ def _pair_observer(quality: Quality) -> Callable[[StereoMeasurement, int], Stere
         cloud = PointCloud(some[valid], extra={name: values[valid] for name, values in pixels.items()})
         measurement = base.changed(cloud=cloud, surroundings=None)
         whole = int(valid.sum() * stride**2 * (step / REDUCTION[quality]) ** 2)
-        return StereoView.of(stereo_residuals(measurement), whole, number, measurement)
+        return SurveyView.of(stereo_residuals(measurement), whole, number, measurement)
 
     return observe
 
