@@ -1,4 +1,9 @@
-"""Thresholds of what is no systematic effect: variance model, pixel locking, rounding, edges, missing returns."""
+"""Thresholds of what is no systematic effect: variance model, pixel locking, rounding, edges, missing returns.
+
+A gain is a log-likelihood ratio of the models with and without an effect; a score is a gain minus a penalty for the parameters.
+Wall blocks are squares of the wall, which count as independent. Their agreement is measured like a number of standard deviations:
+the sum of their gains over the root of the sum of squared gains.
+"""
 
 from __future__ import annotations
 
@@ -10,11 +15,8 @@ from pipeline.gap.threshold_field import DEVELOPMENT, JUDGEMENT, ThresholdGroup,
 class VarianceThresholds(ThresholdGroup):
     """Thresholds by which `gap` accepts noise terms: effects that change the variance of the residuals (variance model).
 
-    A gain is a log-likelihood ratio of the models with and without a term; the score is the gain minus a penalty for the
-    parameters. Wall blocks are squares of the wall, which count as independent. Their agreement is measured like a number of
-    standard deviations: the sum of their gains over the root of the sum of squared gains. An empirical term is a variance that
-    is fitted freely in bins of a covariate, such as the range. The last text of each field states where its value comes from:
-    tuning on development cases, or judgement.
+    An empirical term is a variance that is fitted freely in bins of a covariate, such as the range. Losses free by direction
+    are fitted likewise, in bins of an angle.
     """
 
     least_gain: PositiveFloat = threshold_field(
@@ -115,9 +117,7 @@ class QuantizationThresholds(ThresholdGroup):
 class EdgeThresholds(ThresholdGroup):
     """Thresholds of effects at depth steps: edge fattening, smoothing, filled occlusions and the beam footprint.
 
-    A gain is a log-likelihood ratio of the models with and without an effect. Wall blocks are squares of the wall, which count
-    as independent. Their agreement is measured like a number of standard deviations: the sum of their gains over the root of
-    the sum of squared gains. A cell is a pixel of the disparity raster.
+    A cell is a pixel of the disparity raster.
     """
 
     least_gain: PositiveFloat = threshold_field(
@@ -150,9 +150,7 @@ class EdgeThresholds(ThresholdGroup):
 class MissingReturnsThresholds(ThresholdGroup):
     """Thresholds of the effects that explain why laser pulses did not return: a detection limit, precipitation or a direction.
 
-    A score is a log-likelihood ratio minus a penalty for the parameters. "Free by direction" means that the probability of loss
-    is fitted freely in bins of the azimuth or the zenith angle. Drops are rain or snow, which return some pulses from in front
-    of the wall.
+    Drops are rain or snow, which return some pulses from in front of the wall.
     """
 
     cutoff_ratio: PositiveFloat = threshold_field(

@@ -2,7 +2,8 @@
 
 `scarpsim gap --set mean.class_margin=4` changes one threshold for one diagnosis; gap.json records all values under `decisions`.
 The groups of noise, edges and missing returns are in `noise_thresholds.py`. Purely numerical limits (iterations, simulations,
-grids, smallest divisors) are constants in the modules that use them.
+grids, smallest divisors) are constants in the modules that use them. The last text of each field states where its value comes
+from: tuning on development cases, or judgement.
 """
 
 from __future__ import annotations
@@ -86,8 +87,7 @@ class MeanThresholds(ThresholdGroup):
     A log-likelihood ratio compares models with and without an effect; the score is this ratio minus a penalty for the
     parameters. The equivalence class holds effects that explain the residuals as well as the best one. A signature is the
     change of the observations by an effect. A typical size is the value that an effect's parameter commonly has in instruments.
-    A non-parametric term is a spline of a covariate, such as the range. The last text of each field states where its value
-    comes from: tuning on development cases, or judgement.
+    A non-parametric term is a spline of a covariate, such as the range.
     """
 
     significance: PositiveFloat = threshold_field(
@@ -239,11 +239,9 @@ class VerdictThresholds(ThresholdGroup):
 
 
 class Thresholds(ThresholdGroup):
-    """All thresholds by which `gap` decides when it diagnoses a measurement, in groups.
+    """All thresholds by which `gap` decides when it diagnoses a measurement, in groups of one test each.
 
-    Each attribute is a group for one test: which points are used; systematic effects (mean); noise (variance); pixel
-    locking; effects at depth steps (edges); missing returns; rounded ranges (quantization); changes of the rock;
-    and the verdict.
+    `mean` is about systematic effects, `variance` about noise, `edges` about effects at depth steps.
     """
 
     points: PointThresholds = PointThresholds()
@@ -283,10 +281,8 @@ def thresholds() -> Thresholds:
 def equivalence_margin(log_likelihood_ratio: float) -> float:
     """Return the difference of scores within which two effects count as indistinguishable, so that both are reported.
 
-    It is the threshold `mean.class_margin`, or the share `mean.class_share` of the log-likelihood ratio if that is larger. The
-    pattern of residuals of an effect is linearised, and is inexact by such a share.
-
-    log_likelihood_ratio: log-likelihood with the chosen effect minus that without it.
+    It is the threshold `mean.class_margin`, or the share `mean.class_share` of the log-likelihood ratio of the models with and
+    without the chosen effect if that is larger.
     """
     by = thresholds().mean
     return max(by.class_margin, by.class_share * log_likelihood_ratio)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -14,7 +15,7 @@ from pipeline.gap.mean.candidates import Candidate, SineGrid
 from pipeline.gap.naming import effect_selection, search_beside_effects
 from pipeline.gap.naming.candidate_families import candidate_families
 from pipeline.gap.naming.effect_screening import estimate_of_size
-from pipeline.gap.naming.search_outcome import SearchInput
+from pipeline.gap.naming.search_outcome import SearchInput, SearchOutcome
 from pipeline.gap.residuals.alignment import align, fit_pose_robustly
 from pipeline.gap.residuals.residuals import Residuals
 from scene.common.keyed_random import KeyedRandom
@@ -77,6 +78,8 @@ def test_an_effect_that_a_curve_in_the_model_describes_can_be_known(tmp_path: Pa
         search_beside_effects, "candidate_families", lambda *given: [each for each in _few(*given) if each.name != "range_offset"]
     )
     given = SearchInput(there, part, families, lambda _: [], 0.0, KeyedRandom(1))
-    again = search_beside_effects.repeat_search(given, [estimate_of_size(offset, np.array([0.002]))], {})
+    search: Any = SimpleNamespace(single_effect_ratios={})
+    before = SearchOutcome([], [], search, part, [], ())
+    again = search_beside_effects.repeat_search(given, before, [estimate_of_size(offset, np.array([0.002]))])
     assert again is not None
-    assert again[2][0].candidate.name == "range_offset"
+    assert again.estimates[0].candidate.name == "range_offset"

@@ -51,7 +51,7 @@ def test_every_explanation_gains_beside_others_what_a_fit_of_both_gains(design: 
 
     monkeypatch.setattr(Design, "fit_refined", unmoved)
     plain = design.families.plain
-    effect, form, sine = plain[0], next(each for each in plain if each.form == "parabola"), design.families.sine(7)
+    effect, form, sine = plain[0], next(each for each in plain if each.form == "parabola"), design.families.sines[7]
     assert not effect.empirical
     for members in ([], [effect], [form], [sine, effect], [form, sine]):
         beside = design
@@ -64,7 +64,7 @@ def test_every_explanation_gains_beside_others_what_a_fit_of_both_gains(design: 
         expected = [beside.equations.log_likelihood([*base, *beside.column_numbers[plain[row]]]).max() for row in others]
         np.testing.assert_allclose(fixed[others, 0], expected, atol=1e-5)
         for number in range(30, len(searched), 50):
-            one = beside.families.sine(number)
+            one = beside.families.sines[number]
             both = beside.conditioned_on(one)
             assert searched[number, 0] == pytest.approx(
                 both.equations.log_likelihood(both.columns([*members, one])).max(), abs=1e-5

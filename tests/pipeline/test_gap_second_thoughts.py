@@ -217,11 +217,12 @@ def test_a_low_pass_that_others_feign_takes_no_outlines_along(monkeypatch: pytes
     seen = [EdgeEffect(effect, {}, 50.0, nowhere) for effect in (EdgeFattening(radius_px=3.0), Smoothing(sigma_px=2.0))]
 
     def named(_: Any, state: list[EdgeEffect], *_given: Any) -> Any:
-        return SimpleNamespace(named=["noise"], edge_effect_names={each.name for each in state})
+        return SimpleNamespace(named=["noise"], pass_input=SimpleNamespace(edge_effects=state))
 
     monkeypatch.setattr(SelectionPass, "of", classmethod(named))
     starts: Any = SimpleNamespace(edge_effects=[], edge_effects_given=lambda _: seen, with_these=lambda effects: effects)
-    assert select_beside_edge_effects(starts, KeyedRandom(1), frozenset()).edge_effect_names == {"edge_fattening"}
+    found = select_beside_edge_effects(starts, KeyedRandom(1), frozenset())
+    assert [each.name for each in found.pass_input.edge_effects] == ["edge_fattening"]
 
 
 def test_an_unknown_without_a_name_says_what_remains_is_most_like() -> None:

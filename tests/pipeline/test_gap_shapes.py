@@ -32,7 +32,7 @@ from pipeline.gap.naming.named_effects import with_effects
 from pipeline.gap.noise_and_edges import disparity_edges
 from pipeline.gap.noise_and_edges.beam_footprint import find_footprint
 from pipeline.gap.noise_and_edges.disparity_edges import find_disparity_edge_effects
-from pipeline.gap.noise_and_edges.edge_effects import WallBlocks
+from pipeline.gap.noise_and_edges.edge_effects import agreed_gain
 from pipeline.gap.noise_and_edges.grid_noise import find_grid_noise, separate_white_and_grid_noise
 from pipeline.gap.noise_and_edges.variance_model import fit_variance_model
 from pipeline.gap.residuals import disparity_raster, stereo_residuals
@@ -237,12 +237,12 @@ def test_outlines_in_few_places_agree_by_signs() -> None:
     One block of 60 points and 14 of two all agree: 15 of 15 signs are 3.9 standard deviations; the sums, of which one is largest,
     are only 1.5.
     """
-    number = np.repeat(np.arange(15), [60, *[2] * 14])
-    blocks, gains = WallBlocks(number), np.full(len(number), 2.0)
-    assert blocks.total_if_agreed(gains) is None
-    assert blocks.total_if_agreed(gains, by_signs=True) == pytest.approx(176)
-    against = np.where(number % 3 == 1, -2.0, 2.0)
-    assert blocks.total_if_agreed(against, by_signs=True) is None
+    block = np.repeat(np.arange(15), [60, *[2] * 14])
+    gains = np.full(len(block), 2.0)
+    assert agreed_gain(gains, block) is None
+    assert agreed_gain(gains, block, by_signs=True) == pytest.approx(176)
+    against = np.where(block % 3 == 1, -2.0, 2.0)
+    assert agreed_gain(against, block, by_signs=True) is None
 
 
 @pytest.mark.parametrize(("kind", "seed"), [("smoothing", 1), ("edge_fattening", 4), ("occlusion_fill", 6)])

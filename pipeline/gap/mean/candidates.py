@@ -60,17 +60,10 @@ class Wave:
     def stepped_period(self, period: float, change: float) -> float:
         """Take one step of the search for a sine's period: add `change` to the frequency 1 / period and return the new period.
 
-        The step is limited to 0.3 cycles over the extent of x, the quantity along which the sine runs. The search then cannot
-        jump past a maximum of the likelihood.
+        The step is at most 0.3 cycles over the extent of x, the quantity along which the sine runs. The search then cannot jump
+        past a maximum of the likelihood. The frequency is at least the lowest one to try, the attribute `least`.
 
-        Parameters
-        ----------
-        period : Present period, unit of x.
-        change : Wanted change of the frequency 1 / period, from a Gauss-Newton fit.
-
-        Returns
-        -------
-        The new period, unit of x. Its frequency is at least the lowest one to try, the attribute `least`.
+        period: present period, unit of x. change: wanted change of the frequency, from a Gauss-Newton fit.
         """
         step = 0.3 / float(np.ptp(self.x))
         return 1 / max(1 / period + float(np.clip(change, -step, step)), self.least)
@@ -78,48 +71,31 @@ class Wave:
     def with_frequency_derivative(self, period: float, coefficients: FloatArray) -> FloatArray:
         """Return the design columns of a sinusoidal error for one Gauss-Newton step, which also corrects the frequency.
 
-        The first two columns are the sine and the cosine at the present period. The third one is the derivative of the fitted
-        wave with respect to the frequency 1 / period, at a constant phase in the middle of the points; its coefficient is the
-        correction (see `with_folded_step`).
+        There are (n, 3) columns for n points. The first two are the sine and the cosine at the present period. The third one is
+        the derivative of the fitted wave with respect to the frequency 1 / period, at a constant phase in the middle of the
+        points; its coefficient is the correction (see `with_folded_step`).
 
-        Parameters
-        ----------
-        period : Present period, in the unit of the quantity along which the sine runs.
-        coefficients : (2,) present coefficients of the sine and the cosine column.
-
-        Returns
-        -------
-        (n, 3) columns at the n points.
+        period: present period, in the unit of x. coefficients: (2,) present coefficients of the sine and the cosine column.
         """
         sine, cosine = self.columns(period).T
         derivative = 2 * np.pi * (self.x - self.middle) * (coefficients[0] * cosine - coefficients[1] * sine)
         return np.stack([sine, cosine, derivative], axis=1)
 
     def with_folded_step(self, coefficients: FloatArray, change: float) -> FloatArray:
-        """Return the coefficients of sine and cosine that keep the wave in the middle of the points when its frequency changes.
+        """Return the (2,) coefficients of sine and cosine that keep the wave in the middle of the points at another frequency.
 
         The coefficients belong to the phase at x = 0, which is far outside the points if, for example, x is the range. They
         therefore depend much on the frequency.
 
-        Parameters
-        ----------
-        coefficients : (2,) coefficients of sine and cosine at the present frequency.
-        change : Change of the frequency 1 / period.
-
-        Returns
-        -------
-        (2,) coefficients at the changed frequency.
+        coefficients: (2,) coefficients at the present frequency. change: change of the frequency 1 / period.
         """
         angle = 2 * np.pi * self.middle * change
         rotation = np.array([[np.cos(angle), np.sin(angle)], [-np.sin(angle), np.cos(angle)]])
         return np.asarray(rotation @ coefficients)
 
     def part(self, rows: Rows) -> Wave:
-        """Return the sinusoidal error at a subset of its n points, such as the points that a fit uses.
-
-        rows: numbers of the points to keep, from 0, as an int64 array; they may be in another order.
-        """
-        return Wave(self.key, self.factor[rows], self.x[rows], self.middle, self.least)
+        """Return the sinusoidal error at some of its n points. rows: their numbers, from 0, in the wanted order."""
+        return replace(self, factor=self.factor[rows], x=self.x[rows])
 
 
 @dataclass(frozen=True, eq=False)
@@ -160,30 +136,25 @@ class Candidate:
 
     @cached_property
     def columns(self) -> FloatArray:
-        """(n, k) design columns of a candidate error at n points, for a regression with k coefficients.
-
-        A column is the change of the observable (range, disparity or distance) per unit of a coefficient.
-        """
-        if self.matrix is not None:
-            return self.matrix
-        return self.sine.columns(self.period)
+        """(n, k) design columns at n points: change of the observable (range, disparity, distance) per unit of a coefficient."""
+        return self.sine.columns(self.period) if self.matrix is None else self.matrix
 
     @property
     def sine(self) -> Wave:
-        """Return the `Wave` of a candidate that is a sinusoidal error, such as a wobble along the azimuth.
-
-        From it the design columns for another period can be computed, when the best period is searched. Raises TypeError if the
-        candidate is not sinusoidal.
-        """
+        """The `Wave` of a candidate that is a sinusoidal error, from which columns for other periods follow; else a TypeError."""
         if self.wave is None:
             raise TypeError(f"candidate {self.name} is not a sine")
         return self.wave
 
-    def part(self, rows: Rows) -> Candidate:
-        """Return the candidate at a subset of its n points, such as the points that a fit uses.
+    def columns_given(self, coefficients: FloatArray | None) -> FloatArray:
+        """Return the design columns of a candidate, and for a sine with known coefficients the derivative by its frequency.
 
-        rows: numbers of the points to keep, from 0, as an int64 array; they may be in another order.
+        coefficients: (2,) present coefficients of the sine and the cosine column; None: no correction of a frequency is fitted.
         """
+        return self.columns if coefficients is None else self.sine.with_frequency_derivative(self.period, coefficients)
+
+    def part(self, rows: Rows) -> Candidate:
+        """Return the candidate at some of its n points. rows: their numbers, from 0, in the wanted order."""
         matrix = None if self.matrix is None else self.matrix[rows]
         return replace(self, matrix=matrix, wave=None if self.wave is None else self.wave.part(rows))
 
@@ -222,12 +193,10 @@ class SineGrid:
     empirical: bool = False
     angle: str = ""
 
-    def candidate(self, index: int) -> Candidate:
-        """Return the sinusoidal error at one of its trial frequencies as a candidate for a regression.
-
-        index: index into `frequencies`, from 0.
-        """
-        return self.at_period(1 / float(self.frequencies[index]))
+    @property
+    def candidates(self) -> list[Candidate]:
+        """The sinusoidal error at each of its trial frequencies, as candidates for a regression."""
+        return [self.at_period(1 / float(frequency)) for frequency in self.frequencies]
 
     def at_period(self, period: float) -> Candidate:
         """Return the sinusoidal error with a given period, which need not be one of the trial periods, as a candidate.
@@ -260,9 +229,7 @@ class SineGrid:
         This is quicker than one frequency at a time: the frequencies are evenly spaced, so each pair of columns is the
         preceding pair rotated by the same phase angle at each point.
 
-        Parameters
-        ----------
-        rows : (n,) weight of each point, such as the inverse of its standard deviation; it multiplies the point's row.
+        rows: (n,) weight of each point, such as the inverse of its standard deviation; it multiplies the point's row.
 
         Returns
         -------
@@ -279,40 +246,15 @@ class SineGrid:
         return columns.T
 
     def part(self, rows: Rows) -> SineGrid:
-        """Return the grid of sines at a subset of its n points, such as the points that a fit uses.
-
-        rows: numbers of the points to keep, from 0, as an int64 array; they may be in another order.
-        """
+        """Return the grid of sines at some of its n points. rows: their numbers, from 0, in the wanted order."""
         return replace(self, wave=self.wave.part(rows))
-
-
-def expand_grids(families: list[Candidate | SineGrid]) -> list[Candidate]:
-    """Return a flat list of candidate errors, in which a sine of unknown period becomes one candidate per trial frequency.
-
-    It serves callers that compare all candidates alike, whether their period is searched or not.
-
-    families: candidates with known design columns, and sines with their grids of trial frequencies.
-    """
-    return [
-        candidate
-        for family in families
-        for candidate in (
-            [family.candidate(index) for index in range(len(family.frequencies))] if isinstance(family, SineGrid) else [family]
-        )
-    ]
 
 
 def amplitude_and_phase(values: FloatArray, amplitude: str) -> dict[str, float]:
     """Convert the fitted coefficients of a sine and a cosine to amplitude and phase: a sin x + b cos x = A sin(x + phase).
 
-    Parameters
-    ----------
-    values : (2,) coefficients a and b, in any unit.
-    amplitude : Name under which A is returned, such as "amplitude_px".
-
-    Returns
-    -------
-    The amplitude A under the given name, in the unit of a and b, and `phase_rad`, the phase in rad.
+    values: (2,) coefficients a and b, in any unit. amplitude: name under which A is returned, such as "amplitude_px". The phase
+    is in rad.
     """
     return {amplitude: float(np.hypot(*values)), "phase_rad": float(np.arctan2(values[1], values[0]))}
 
@@ -332,17 +274,11 @@ def frequency_grid(low: float, high: float, step: float, most: int = 200) -> Flo
 def disparity_frequencies(cycles: float, reach: float) -> FloatArray:
     """Return trial frequencies for pixel locking, the error of a stereo matcher that repeats with the pixels of the disparity.
 
-    The matcher may have worked in a rectification of another scale than the nominal one. The frequencies therefore reach from
-    3 % below the nominal one to 3 % above it.
+    The matcher may have worked in a rectification of another scale than the nominal one. The (f,) frequencies, at most 80,
+    therefore reach from 3 % below the nominal one to 3 % above it, in cycles per pixel of disparity.
 
-    Parameters
-    ----------
-    cycles : Nominal frequency, cycles per pixel of disparity.
-    reach : Difference of the largest and smallest disparity, px; it determines the spacing of the frequencies.
-
-    Returns
-    -------
-    (f,) frequencies, cycles per pixel of disparity; at most 80.
+    cycles: nominal frequency, cycles per pixel. reach: difference of the largest and smallest disparity, px, which determines
+    the spacing of the frequencies.
     """
     return frequency_grid(cycles * (1 - _SCALE_UNKNOWN), cycles * (1 + _SCALE_UNKNOWN), 0.3 / max(reach, 1.0), _MOST_SCALES)
 
@@ -350,28 +286,17 @@ def disparity_frequencies(cycles: float, reach: float) -> FloatArray:
 def with_period(candidate: Candidate, period: float) -> Candidate:
     """Return a copy of a sinusoidal candidate with another period, as a search for the best period needs it.
 
-    Parameters
-    ----------
-    candidate : Candidate error that is a sine. TypeError is raised for another one.
-    period : New period, in the unit of the quantity along which the sine runs.
+    candidate: a sine; TypeError is raised for another one. period: in the unit of the quantity along which the sine runs.
     """
-    sine, fixed = candidate.sine, candidate.fixed
-    return SineGrid(candidate.name, candidate.names[0], sine, np.empty(0), fixed, candidate.empirical, candidate.angle).at_period(
-        period
-    )
+    sine = candidate.sine
+    grid = SineGrid(candidate.name, candidate.names[0], sine, np.empty(0), candidate.fixed, candidate.empirical, candidate.angle)
+    return grid.at_period(period)
 
 
 def prior_precision(candidate: Candidate, width: int) -> FloatArray:
-    """Return the prior inverse variances of a candidate's coefficients, as a regression with priors needs them.
+    """Return the prior inverse variances of a candidate's coefficients; all 0 if it has no prior, as no sine has.
 
-    Parameters
-    ----------
-    candidate : The candidate error.
-    width : Number of coefficients that are fitted: 2 for a sine, 3 if its frequency is corrected too, else the number of the
-        candidate's design columns.
-
-    Returns
-    -------
-    (width,) prior inverse variances; all 0 for a candidate without a prior, as every sine is.
+    width: number of coefficients that are fitted: 2 for a sine, 3 if its frequency is corrected too, else the number of the
+    candidate's design columns.
     """
     return np.zeros(width) if candidate.prior_precision is None else candidate.prior_precision

@@ -5,9 +5,10 @@ Their normal equations are part of the design. Designs are immutable.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from itertools import zip_longest
 from typing import Any
 
 import numpy as np
@@ -28,6 +29,8 @@ NULL_DRAWS = 499
 """Number of simulations of the null distribution."""
 _NULL_ROWS = 8_000
 """Most points on which white noise is drawn."""
+_REFINING_ROUNDS = 4
+"""Gauss-Newton steps by which the period of a sine is refined."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,45 +49,22 @@ class CandidateFamilies:
     plain: list[Candidate]
     grids: list[SineGrid]
 
-    @classmethod
-    def of(cls, families: list[Candidate | SineGrid]) -> CandidateFamilies:
-        """Divide a list of candidate explanations of residuals into those with known columns and sines of unknown period.
-
-        families: the candidates, in any order; a sine of unknown period is one `SineGrid` with all its trial frequencies.
-        """
-        plain = sorted((family for family in families if isinstance(family, Candidate)), key=lambda each: each.empirical)
-        return cls(plain, [family for family in families if isinstance(family, SineGrid)])
+    @cached_property
+    def sines(self) -> list[Candidate]:
+        """All trial sines: the first sine of `grids` at each of its trial frequencies, then the second one, and so on."""
+        return [candidate for grid in self.grids for candidate in grid.candidates]
 
     @cached_property
     def by_name(self) -> dict[str, tuple[list[int], list[int]]]:
-        """Variants of each family, by the family's name, so that the search can find the best variant of each.
+        """Variants of each family of candidate errors, by the family's name: indices into `plain`, and indices into `sines`.
 
         A family is one explanation of the residuals with all its variants, such as an effect with each camera or period.
-
-        The value is two lists of indices. The first one holds indices into the list `plain` of candidates with known design
-        columns. The second one holds numbers of trial sines, as the method `sine` takes them.
         """
         families: dict[str, tuple[list[int], list[int]]] = {}
-        for row, candidate in enumerate(self.plain):
-            families.setdefault(candidate.family, ([], []))[0].append(row)
-        start = 0
-        for grid in self.grids:
-            stop = start + len(grid.frequencies)
-            families.setdefault(grid.candidate(0).family, ([], []))[1].extend(range(start, stop))
-            start = stop
+        for kind, candidates in enumerate((self.plain, self.sines)):
+            for row, candidate in enumerate(candidates):
+                families.setdefault(candidate.family, ([], []))[kind].append(row)
         return families
-
-    def sine(self, number: int) -> Candidate:
-        """Return a sinusoidal error at one of its trial frequencies as a candidate.
-
-        number: running number of the trial sine, from 0. It counts the trial frequencies of the first sine in the list `grids`,
-        then those of the second one, and so on. Raises IndexError if there are fewer.
-        """
-        for grid in self.grids:
-            if number < len(grid.frequencies):
-                return grid.candidate(number)
-            number -= len(grid.frequencies)
-        raise IndexError(number)
 
 
 @dataclass(frozen=True, eq=False)
@@ -148,15 +128,16 @@ class Design:
         random : Source of the random numbers for the simulated noise.
         pose_precision : (p,) prior inverse variances of the coefficients of `residuals.pose_jacobian`; None: no prior.
         """
-        chosen = CandidateFamilies.of(families)
+        plain = sorted((family for family in families if isinstance(family, Candidate)), key=lambda each: each.empirical)
+        chosen = CandidateFamilies(plain, [family for family in families if isinstance(family, SineGrid)])
         cells = WallCells.over(residuals.wall_xy)
         model = MeanModel(cells, residuals.wall_xy, residuals.sigma, residuals.correlated_noise)
         rows, root = model.rows, model.inverse_sigma[:, None]
         pose, turn = np.linalg.qr(residuals.pose_jacobian[rows] * root)
         count = pose.shape[1]
         precision = np.zeros(count) if pose_precision is None else pose_precision
-        place = _number_columns(chosen.plain, count)
-        fixed = model.project(_columns(model, pose, chosen.plain, place))
+        place = _number_columns(plain, count)
+        fixed = model.project(_columns(model, pose, plain, place))
         value = model.project(residuals.value[rows, None] * root)
         most_sigma = thresholds().mean.most_reference_error / float(np.median(residuals.unit_m))
         within = WithinProducts.of(fixed, value)
@@ -164,12 +145,10 @@ class Design:
         fixed, value = fixed.in_bases(bases), value.in_bases(bases)
         noise = NoiseDraws.of(model, NULL_DRAWS, _NULL_ROWS, random.child("within"))
         grids = [grid.part(rows) for grid in chosen.grids]
-        held_count = count + sum(
-            len(place[each]) for each in chosen.plain if not each.empirical
-        )  # few non-parametric ones are held
+        held_count = count + sum(len(place[each]) for each in plain if not each.empirical)  # few non-parametric ones are held
         waves = SineProducts.of(model, grids, fixed.within_weighted[:, :held_count], value, noise)
-        known = [np.zeros(count), *(prior_precision(each, each.columns.shape[1]) for each in chosen.plain)]
-        equations = assemble(covariances, fixed, value, within, waves).with_precision(np.concatenate(known))
+        known = [np.zeros(count), *(prior_precision(each, len(place[each])) for each in plain)]
+        equations = assemble(covariances, fixed, value, within, waves, np.concatenate(known))
         drawn = noise.products(fixed.within[noise.rows], model.within_noise.to_nodes(fixed.within))
         found = cls(
             residuals, chosen, cells, model, pose, turn, precision, grids, value, fixed, None, place, waves, drawn, equations
@@ -178,36 +157,25 @@ class Design:
 
     @cached_property
     def pose_columns(self) -> list[int]:
-        """Numbers of the design columns of the sensor's pose: 0 to p - 1 for p pose parameters.
-
-        Every model that is fitted contains them; the columns of candidate errors come after them.
-        """
+        """Numbers of the design columns of the sensor's p pose parameters, 0 to p - 1; every fitted model contains them."""
         return list(range(self.pose_basis.shape[1]))
 
     @cached_property
     def ranked_covariances(self) -> list[int]:
-        """Trial covariances of the reference surface's error, ranked from the most to the least likely.
+        """Trial covariances of the reference surface's error, as indices into `equations.covariances`, the most likely first.
 
-        They are indices into `equations.covariances`. The likelihood is that of a fit of the sensor's pose alone, without any
-        candidate error. Simulations without an effect save time by using only the first ones.
+        The likelihood is that of a fit of the sensor's pose alone, without any candidate error.
         """
         return [int(row) for row in np.argsort(-self.equations.log_likelihood(self.pose_columns)[:, 0], kind="stable")]
 
     @property
     def null_covariance(self) -> CellCovariance:
-        """The covariance of the cell means that is most likely if only the sensor's pose is fitted, without any candidate error.
-
-        It is the sum of the reference surface's error, correlated between the cells of the wall, and noise. Simulations
-        without a sensor error are drawn under it.
-        """
+        """The covariance of the cell means (reference error plus noise) that is most likely if only the pose is fitted."""
         return self.equations.covariances[self.ranked_covariances[0]]
 
     @property
     def plain_columns(self) -> list[list[int]]:
-        """For each candidate with known design columns, the numbers of its columns, by which it is scored.
-
-        One list for each candidate of `families.plain`, in that order. Sines of unknown period are not among them.
-        """
+        """For each candidate of `families.plain` (known design columns) in that order, the numbers of its columns."""
         return [self.column_numbers[candidate] for candidate in self.families.plain]
 
     def conditioned_on(self, candidate: Candidate) -> Design:
@@ -216,9 +184,7 @@ class Design:
         Its coefficients are then fitted together with those of each further candidate. The period of a sine is first refined
         from the trial frequency to the maximum of the likelihood, and stays fixed from then on.
 
-        Parameters
-        ----------
-        candidate : The candidate to put into the model, at the same n points. It need not be one of `families`.
+        candidate: the candidate to put into the model, at the same n points; it need not be one of `families`.
         """
         design = self if candidate in self.column_numbers else self._with_sine(candidate)
         return design._with_products(design.column_numbers[candidate])
@@ -243,7 +209,7 @@ class Design:
     def _with_sine(self, candidate: Candidate) -> Design:
         """Make a sine, with its period refined, a fixed column."""
         (found,) = self.fit_refined([candidate])[0]
-        added = self.model.project(_projected(self.pose_basis, self._matrix([found], None)))
+        added = self.model.project(_projected(self.pose_basis, np.concatenate(self._matrices([found]), axis=1)))
         had = [self.fixed] if self.sine_columns is None else [self.fixed, self.sine_columns]
         equations = extend(self.equations, had, self.value, added)
         start = sum(each.within.shape[1] for each in had)
@@ -253,9 +219,7 @@ class Design:
         )
 
     def columns(self, candidates: Sequence[Candidate]) -> list[int]:
-        """Return the numbers of all design columns of a model, with which its normal equations are solved.
-
-        The columns of the sensor's pose come first, then those of the candidate errors.
+        """Return the numbers of all design columns of a model: those of the sensor's pose, then those of the candidate errors.
 
         candidates: candidate errors in the model. A sine must have been put into this design by `conditioned_on`.
         """
@@ -266,16 +230,13 @@ class Design:
 
         It tells whether residuals become more likely when effects are refitted without linearisation.
 
-        Parameters
-        ----------
-        value : (n,) the other residuals, in the unit of the observable (m, or px of disparity).
-        candidates : The candidate errors.
+        value: (n,) the other residuals, in the unit of the observable (m, or px of disparity). candidates: the candidate errors.
         """
-        columns = self._projected_pose.append(self.model.project(_projected(self.pose_basis, self._matrix(candidates, None))))
+        columns = self._with_pose(np.concatenate(self._matrices(candidates), axis=1))
         projected = self.model.project(value[self.model.rows, None] * self.model.inverse_sigma[:, None])
         return fit_reml(self.model.covariances, columns, projected).log_likelihood
 
-    def fit(self, candidates: list[Candidate], wave_coefficients: list[FloatArray | None] | None = None) -> MeanFit:
+    def fit(self, candidates: list[Candidate], wave_coefficients: Sequence[FloatArray | None] = ()) -> MeanFit:
         """Fit the sensor's pose and some candidate errors jointly to the residuals by generalised least squares.
 
         The covariance of the reference surface's error is the one that is most likely for this model.
@@ -284,8 +245,7 @@ class Design:
         ----------
         candidates : Candidate errors to fit; none: the pose alone.
         wave_coefficients : One entry for each candidate. For a sine whose frequency is to be corrected as well: its present (2,)
-            sine and cosine coefficients. For any other candidate: None. If None is given instead of a list, no frequency is
-            corrected.
+            sine and cosine coefficients. For any other candidate: None. Empty if no frequency is corrected.
 
         Returns
         -------
@@ -293,37 +253,20 @@ class Design:
         in order. A sine whose frequency is corrected has the correction as its third coefficient.
         """
         turned = np.linalg.inv(self.pose_transform)
-        if not candidates:
-            known = np.asarray(turned.T @ (self.pose_precision[:, None] * turned), dtype=np.float64)
-            found = fit_reml(self.model.covariances, self._projected_pose, self.value, known)
-            return replace(found, coefficients=turned @ found.coefficients, covariance=turned @ found.covariance @ turned.T)
-        matrix = self._matrix(candidates, wave_coefficients)
-        columns = self._projected_pose.append(self.model.project(_projected(self.pose_basis, matrix)))
+        matrices = self._matrices(candidates, wave_coefficients)
+        matrix = np.concatenate([np.empty((len(self.pose_basis), 0)), *matrices], axis=1)
         # the fit uses orthonormal columns of the pose, projected out of the candidates; this matrix transforms back
-        back = np.block(
-            [
-                [turned, -turned @ (self.pose_basis.T @ matrix)],
-                [np.zeros((matrix.shape[1], len(turned))), np.eye(matrix.shape[1])],
-            ]
-        )
-        widths = [
-            candidate.columns.shape[1] + (coefficients is not None)
-            for candidate, coefficients in _with_wave_coefficients(candidates, wave_coefficients)
-        ]
-        typical = [prior_precision(each, width) for each, width in zip(candidates, widths, strict=True)]
+        below = np.zeros((matrix.shape[1], len(turned)))
+        back = np.block([[turned, -turned @ (self.pose_basis.T @ matrix)], [below, np.eye(matrix.shape[1])]])
+        typical = [prior_precision(each, own.shape[1]) for each, own in zip(candidates, matrices, strict=True)]
         precision = np.concatenate([self.pose_precision, *typical])
-        found = fit_reml(self.model.covariances, columns, self.value, back.T @ (precision[:, None] * back))
+        found = fit_reml(self.model.covariances, self._with_pose(matrix), self.value, back.T @ (precision[:, None] * back))
         return replace(found, coefficients=back @ found.coefficients, covariance=back @ found.covariance @ back.T)
 
-    def fit_refined(self, candidates: list[Candidate], rounds: int = 4) -> tuple[list[Candidate], MeanFit]:
+    def fit_refined(self, candidates: list[Candidate]) -> tuple[list[Candidate], MeanFit]:
         """Fit the sensor's pose and some candidate errors jointly, and refine the periods of sines.
 
         Periods are refined by Gauss-Newton from a trial value to the maximum of the likelihood.
-
-        Parameters
-        ----------
-        candidates : Candidate errors to fit.
-        rounds : Largest number of Gauss-Newton steps.
 
         Returns
         -------
@@ -332,53 +275,40 @@ class Design:
         """
         found = list(candidates)
         wave_coefficients: list[FloatArray | None] = [None] * len(found)
-        if any(candidate.wave is not None for candidate in found):
-            for _ in range(rounds):
-                fit = self.fit(found, wave_coefficients)
-                start = len(self.pose_columns)
-                for index, candidate in enumerate(found):
-                    wave, present = candidate.wave, wave_coefficients[index]
-                    width = candidate.columns.shape[1] + (present is not None)
-                    values, start = fit.coefficients[start : start + width], start + width
-                    if wave is None:
-                        continue
-                    if present is None:
-                        wave_coefficients[index] = values
-                        continue
+        for _ in range(_REFINING_ROUNDS if any(candidate.wave is not None for candidate in found) else 0):
+            fit = self.fit(found, wave_coefficients)
+            start = len(self.pose_columns)
+            for index, candidate in enumerate(found):
+                wave, present = candidate.wave, wave_coefficients[index]
+                width = candidate.columns.shape[1] + (present is not None)
+                values, start = fit.coefficients[start : start + width], start + width
+                if wave is not None and present is not None:
                     period = wave.stepped_period(candidate.period, float(values[2]))
-                    wave_coefficients[index] = wave.with_folded_step(values[:2], 1 / period - 1 / candidate.period)
+                    values = wave.with_folded_step(values[:2], 1 / period - 1 / candidate.period)
                     found[index] = with_period(candidate, period)
+                wave_coefficients[index] = None if wave is None else values
         return found, self.fit(found, wave_coefficients)
 
     def split_coefficients(self, values: NDArray[Any], candidates: list[Candidate]) -> list[NDArray[Any]]:
         """Divide the coefficients of a joint fit into one array for each candidate error, without those of the pose.
 
-        Parameters
-        ----------
-        values : (k,) coefficients, as `fit_refined` returns them; or any other array with one value for each coefficient.
-        candidates : The fitted candidates, in the order of the fit.
+        A sine has three values: sine, cosine and correction of the frequency.
 
-        Returns
-        -------
-        One array for each candidate; a sine has three values: sine, cosine and correction of the frequency.
+        values: (k,) coefficients, as `fit_refined` returns them; or any other array with one value for each coefficient.
+        candidates: the fitted candidates, in the order of the fit.
         """
         widths = [candidate.columns.shape[1] + (candidate.wave is not None) for candidate in candidates]
         return np.split(values[len(self.pose_columns) :], np.cumsum(widths)[:-1]) if candidates else []
 
     def reference_sigma(self, candidates: list[Candidate]) -> float:
-        """Estimate the standard deviation of the reference surface's spatially correlated error.
+        """Estimate the standard deviation of the reference surface's spatially correlated error, m (or px of disparity).
 
-        It is in the unit of the observable (m, or px of disparity).
-
-        candidates: candidate sensor errors that are fitted jointly with the pose, so that they do not count as reference
-        error.
+        candidates: candidate sensor errors that are fitted jointly with the pose, so that they do not count as reference error.
         """
         return float(np.sqrt(self.fit(candidates).cell_covariance.variance_ratio)) * self.model.typical_sigma
 
     def residuals_after(self, chosen: list[Candidate]) -> FloatArray:
-        """Return the (n,) residuals minus the fitted pose and some fitted errors, to see what these leave unexplained.
-
-        They are in the unit of the observable (m, or px of disparity).
+        """Return the (n,) residuals minus the fitted pose and some fitted errors, m (or px), to see what these leave unexplained.
 
         chosen: candidate errors to fit jointly with the pose; the periods of sines are refined.
         """
@@ -388,8 +318,9 @@ class Design:
             value = value - candidate.columns @ coefficients[: candidate.columns.shape[1]]
         return np.asarray(value)
 
+    @cached_property
     def identifiability(self) -> tuple[list[str], FloatArray, FloatArray]:
-        """Compare the signatures of all effects, to show which sensor errors this measurement cannot tell apart.
+        """Similarity of the signatures of all effects, which shows which sensor errors this measurement cannot tell apart.
 
         An effect's signature is the pattern of residuals that it makes. Two effects whose signatures have a cosine near 1 in
         magnitude cannot be distinguished. If a change of the sensor's pose makes nearly the same residuals, the effect cannot be
@@ -401,31 +332,27 @@ class Design:
         cosines : (f, f) cosines between the signatures, after the part that the pose can imitate is taken out of each.
         shares : (f,) share of each signature's norm that is left then, from 0 to 1.
         """
-        row = self.ranked_covariances[0]
         names: list[str] = []
         matrices = []
         for name, (plain, sines) in self.families.by_name.items():
-            candidate = self.families.plain[plain[0]] if plain else self.families.sine(sines[len(sines) // 2])
+            candidate = self.families.plain[plain[0]] if plain else self.families.sines[sines[len(sines) // 2]]
             if not candidate.empirical:
                 names.append(name)
                 matrices.append(candidate.columns[self.model.rows, :1] * self.model.inverse_sigma[:, None])
         if not names:
             return [], np.zeros((0, 0)), np.zeros(0)
         whole = np.concatenate(matrices, axis=1)
-        weight = self.equations.covariances[row].weight[:, None]
-        grams = []
-        for columns in (whole, left := _projected(self.pose_basis, whole)):
-            projected = self.model.project(columns)
-            between = projected.between[self.null_covariance.basis]
-            grams.append(projected.within.T @ projected.within_weighted + (between * weight).T @ between)
-        count = len(self.pose_columns)
-        matrix, pose = grams[1], self.equations.fixed[row][:count, :count]
-        found, base = self.model.project(left), self.fixed
-        cross = base.within[:, :count].T @ found.within_weighted
-        cross += base.between[self.null_covariance.basis][:, :count].T @ (weight * found.between[self.null_covariance.basis])
-        matrix = matrix - cross.T @ np.linalg.solve(pose, cross)
+        row, count = self.ranked_covariances[0], len(self.pose_columns)
+        basis, weight = self.null_covariance.basis, self.null_covariance.weight[:, None]
+        parts = [self.model.project(columns) for columns in (whole, _projected(self.pose_basis, whole))]
+        before, matrix = (
+            each.within.T @ each.within_weighted + (each.between[basis] * weight).T @ each.between[basis] for each in parts
+        )
+        cross = self.fixed.within[:, :count].T @ parts[1].within_weighted
+        cross += self.fixed.between[basis][:, :count].T @ (weight * parts[1].between[basis])
+        matrix = matrix - cross.T @ np.linalg.solve(self.equations.fixed[row][:count, :count], cross)
         size = np.sqrt(np.maximum(np.diag(matrix), 0))
-        full = np.sqrt(np.maximum(np.diag(grams[0]), 1e-200))  # avoids dividing by a signature of 0
+        full = np.sqrt(np.maximum(np.diag(before), 1e-200))  # avoids dividing by a signature of 0
         scale = np.maximum(size, 1e-12 * full)
         return names, np.clip(matrix / np.outer(scale, scale), -1, 1), size / full
 
@@ -434,19 +361,16 @@ class Design:
         """Projected columns of the pose."""
         return self.fixed.select(self.pose_columns)
 
-    def _matrix(self, candidates: list[Candidate], wave_coefficients: list[FloatArray | None] | None) -> FloatArray:
-        """Columns of some candidates over sigma, with a sine's derivative by its frequency if its coefficients are given."""
+    def _with_pose(self, matrix: FloatArray) -> ProjectedColumns:
+        """Projected columns of the pose, and of candidates, whose columns (n, k) over sigma are given."""
+        if not matrix.shape[1]:
+            return self._projected_pose
+        return ProjectedColumns.concatenate([self._projected_pose, self.model.project(_projected(self.pose_basis, matrix))])
+
+    def _matrices(self, candidates: list[Candidate], wave_coefficients: Sequence[FloatArray | None] = ()) -> list[FloatArray]:
+        """Columns of each candidate over sigma, with a sine's derivative by its frequency if its coefficients are given."""
         rows, root = self.model.rows, self.model.inverse_sigma[:, None]
-        matrices = []
-        for candidate, coefficients in _with_wave_coefficients(candidates, wave_coefficients):
-            wave = candidate.wave
-            columns = (
-                candidate.columns
-                if wave is None or coefficients is None
-                else wave.with_frequency_derivative(candidate.period, coefficients)
-            )
-            matrices.append(columns[rows] * root)
-        return np.concatenate(matrices, axis=1)
+        return [each.columns_given(known)[rows] * root for each, known in zip_longest(candidates, wave_coefficients)]
 
 
 def _columns(model: MeanModel, pose: FloatArray, plain: list[Candidate], place: Mapping[Candidate, list[int]]) -> FloatArray:
@@ -489,10 +413,3 @@ def _number_columns(plain: list[Candidate], start: int) -> dict[Candidate, list[
     for candidate in plain:
         place[candidate] = list(range(start, start := start + candidate.columns.shape[1]))
     return place
-
-
-def _with_wave_coefficients(
-    candidates: list[Candidate], wave_coefficients: list[FloatArray | None] | None
-) -> Iterator[tuple[Candidate, FloatArray | None]]:
-    """Pair candidates with the coefficients of their sines."""
-    return zip(candidates, wave_coefficients or [None] * len(candidates), strict=True)

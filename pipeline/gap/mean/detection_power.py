@@ -90,44 +90,28 @@ class Signature:
     needed: Callable[[Sequence[int]], float]
 
     def direction(self, information: FloatArray) -> FloatArray:
-        """Return the direction in the space of an error's k coefficients along which its detectable size is computed.
+        """Return the direction (k,), a unit vector of an error's k coefficients, along which its detectable size is computed.
 
         It is the coefficient of the examined parameter alone; for a wave it is the phase that is hardest to detect.
 
         information: (k, k) Fisher information of the k coefficients: how precisely the measurement determines them.
-
-        Returns
-        -------
-        (k,) unit vector.
         """
         if self.sine:
             return np.asarray(np.linalg.eigh(information)[1][:, 0])
         return np.eye(len(information))[self.candidate.names.index(self.parameter)]
 
-    @property
-    def at(self) -> dict[str, float | str]:
-        """Values for which the detectable size holds and that are not fitted, by name, such as the period or the camera."""
-        return dict(self.candidate.fixed)
 
+def noncentrality(needed: float, columns: int) -> float:
+    """Return how far an effect must stand out of the noise for a likelihood-ratio test to detect it with a probability of 95 %.
 
-def noncentrality(needed: float, columns: int, power: float = POWER) -> float:
-    """Return how far an effect must stand out of the noise for a likelihood-ratio test to detect it with a given probability.
+    Twice the log-likelihood ratio follows a noncentral chi-square distribution. Its noncentrality, which is returned, grows with
+    the square of the effect's size, so that the detectable size follows from it.
 
-    Twice the log-likelihood ratio follows a noncentral chi-square distribution. Its noncentrality grows with the square of the
-    effect's size, so that the detectable size follows from it.
-
-    Parameters
-    ----------
-    needed : Log-likelihood ratio from which the test is passed.
-    columns : Number of design columns of the effect, the degrees of freedom.
-    power : The probability, from 0 to 1.
-
-    Returns
-    -------
-    The noncentrality at which the needed ratio is exceeded with that probability.
+    needed: log-likelihood ratio from which the test is passed. columns: number of design columns of the effect, the degrees of
+    freedom.
     """
     at, rare = 2 * needed, 1e-9
-    return float(brentq(lambda x: ncx2.sf(at, columns, x) - power, rare, 4 * (at + 10 * columns + 10)))
+    return float(brentq(lambda x: ncx2.sf(at, columns, x) - POWER, rare, 4 * (at + 10 * columns + 10)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -166,7 +150,7 @@ class DetectionPower:
         members : The found errors, fitted beside each examined error. Sines among them only determine the most likely
             covariance.
         plain : Numbers of the design columns to examine, of candidates that have known columns.
-        sines : Numbers of the trial sines to examine, as `CandidateFamilies.sine` takes them. In the result the examined columns
+        sines : Numbers of the trial sines to examine, indices into `CandidateFamilies.sines`. In the result the examined columns
             are those of `plain`, then the sine and the cosine column of each trial sine.
         random : Source of the random numbers.
         """
@@ -286,25 +270,19 @@ def detectable_sizes(
     """
     names = {each.name for each in members if not each.empirical}
     plain = [each for each in design.families.plain if not each.empirical and each.name not in names and not _both(each)]
-    numbers = [number for number in _examined_sines(design) if design.families.sine(number).name not in names]
+    numbers = [number for number in _examined_sines(design) if design.families.sines[number].name not in names]
     columns = [column for each in plain for column in design.column_numbers[each]]
-    place = {column: row for row, column in enumerate(columns)}
     power = DetectionPower.of(design, members, columns, numbers, random)
     found: dict[tuple[str, str], list[DetectableSize]] = {}
-    for each in plain:
-        rows = [place[column] for column in design.column_numbers[each]]
+    start = 0
+    for each in [*plain, *(design.families.sines[number] for number in numbers)]:
+        rows = list(range(start, start := start + (len(design.column_numbers[each]) if each.wave is None else 2)))
+        name, at = (f"smooth error along {each.name}", {}) if each.empirical else (each.name, dict(each.fixed))
         sine = _PHASE in each.names
         for parameter in each.names[:1] if sine else each.names:
             size = power.size(Signature(each, parameter, rows, sine, partial(needed, each)))
-            found.setdefault((each.name, parameter), []).append(DetectableSize(each.name, parameter, size, dict(each.fixed)))
-    for row, number in enumerate(numbers):
-        each = design.families.sine(number)
-        rows = [len(columns) + 2 * row, len(columns) + 2 * row + 1]
-        size = power.size(Signature(each, each.names[0], rows, True, partial(needed, each)))
-        name = f"smooth error along {each.name}" if each.empirical else each.name
-        at = {} if each.empirical else dict(each.fixed)
-        parameter = "" if each.empirical else each.names[0]
-        found.setdefault((name, parameter), []).append(DetectableSize(name, parameter, size, at))
+            key = name, "" if each.empirical else parameter
+            found.setdefault(key, []).append(DetectableSize(*key, size, at))
     return [_of_variants(variants) for variants in found.values()]
 
 
@@ -325,19 +303,14 @@ def _of_variants(variants: list[DetectableSize]) -> DetectableSize:
 
 def _examined_sines(design: Design) -> list[int]:
     """Numbers of the sines to examine: the middle period of each effect, and one cycle along each covariate of the position."""
-    found: list[int] = []
-    start, seen = 0, set()
+    found: dict[tuple[str, object], int] = {}
+    start = 0
     for grid in design.families.grids:
         count = len(grid.frequencies)
         if not grid.empirical:
-            key = grid.name, grid.fixed.get("camera")
-            if key not in seen:
-                found.append(start + count // 2)
-            seen.add(key)
+            found.setdefault((grid.name, grid.fixed.get("camera")), start + count // 2)
         elif grid.name in design.residuals.position_covariates and not grid.angle:
             once = 1 / robust_extent(grid.wave.x)
-            if (grid.name, "") not in seen:
-                found.append(start + int(np.argmin(np.abs(grid.frequencies - once))))
-            seen.add((grid.name, ""))
+            found.setdefault((grid.name, ""), start + int(np.argmin(np.abs(grid.frequencies - once))))
         start += count
-    return found
+    return list(found.values())

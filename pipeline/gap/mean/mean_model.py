@@ -63,9 +63,8 @@ _NOTHING = 1e-14
 class CellCovariance:
     """A trial covariance of the mean residuals in m square cells of the wall, under which candidate errors are fitted.
 
-    It is the sum of two parts: the error of the reference surface, which is correlated between cells, and the sensor's noise.
-    Cell means are divided by the standard deviations of their noise, so that the noise has the unit matrix as covariance. The
-    true covariance is not known, so several are tried.
+    It is the sum of two parts: the error of the reference surface, which is correlated between cells, and the sensor's noise,
+    which has the unit matrix as covariance because cell means are divided by its standard deviations.
 
     Attributes
     ----------
@@ -177,8 +176,8 @@ class MeanModel:
     ) -> tuple[MeanModel, list[CellCovariance], list[int]]:
         """Drop trial covariances of the reference surface's error under which the residuals are unlikely, to save time later.
 
-        A trial covariance has a correlation function and an amplitude. A function is kept if the residuals are likely under it
-        with the smallest or with the largest model fitted. Of its amplitudes, only those near the most likely ones are kept.
+        A correlation function is kept if the residuals are likely under it with the smallest or with the largest model fitted.
+        Of its amplitudes, only those near the most likely ones are kept.
 
         Parameters
         ----------
@@ -220,8 +219,7 @@ class MeanModel:
     def covariances(self) -> list[CellCovariance]:
         """The trial covariances of the mean residuals in the cells of the wall, for fits that pick the most likely one.
 
-        Each is the sum of the reference surface's error and noise. There is one for each pair of a correlation function and an
-        amplitude of the reference's error that the model tries; `restrict` returns a model that tries fewer.
+        There is one for each pair of a correlation function and an amplitude of the reference surface's error that is tried.
         """
         return [self._covariance(basis, float(ratio)) for basis in range(len(self._bases)) for ratio in self._ratios]
 
@@ -250,10 +248,8 @@ class MeanModel:
         A plane takes up the reference surface's error within a cell, so that the deviations from it are nearly independent. If
         neighbouring points share noise, a constant is fitted instead.
 
-        Parameters
-        ----------
-        weighted : (n', k) columns at n' points, divided by the standard deviation of each point.
-        rows : Slice that selects these n' points from all n.
+        weighted: (n', k) columns at n' points, divided by the standard deviation of each point. rows: slice that selects these
+        points from all n.
 
         Returns
         -------
@@ -283,16 +279,10 @@ class MeanModel:
     def in_bases(self, means: FloatArray) -> list[FloatArray]:
         """Transform cell means of design columns so that they are uncorrelated under each trial covariance.
 
-        They become coordinates in the eigenvectors of the covariance's correlation function. A fit then only needs the
-        eigenvalues, whatever the amplitude of the reference surface's error.
+        They become coordinates in the eigenvectors of each trial correlation function of the reference surface's error: one
+        (m, k) array for each. A fit then only needs the eigenvalues, whatever the amplitude of that error.
 
-        Parameters
-        ----------
-        means : (m, k) means of k columns in the m cells of the wall, divided by their standard deviations.
-
-        Returns
-        -------
-        One (m, k) array for each trial correlation function of the reference's error.
+        means: (m, k) means of k columns in the m cells of the wall, divided by their standard deviations.
         """
         white = self._whitened(means)
         return map_in_threads(lambda basis: np.asarray(basis[1].T @ white), self._bases)
@@ -331,13 +321,7 @@ class MeanModel:
     def null_draws(self, at: CellCovariance, count: int, random: KeyedRandom) -> list[FloatArray]:
         """Simulate mean residuals in the m cells of the wall that contain only noise and the reference surface's error.
 
-        They show how well candidate errors explain residuals by chance.
-
-        Parameters
-        ----------
-        at : Covariance of the cell means under which all draws are made.
-        count : Number of draws.
-        random : Source of the random numbers.
+        They show how well candidate errors explain residuals by chance. There are `count` draws, made under the covariance `at`.
 
         Returns
         -------
@@ -388,13 +372,7 @@ _CORRELATIONS: list[tuple[float, Callable[[FloatArray], FloatArray]]] = [
 
 @dataclass(frozen=True)
 class _NormalEquations:
-    """The part of one design's normal equations that does not depend on the covariance of the cells' means.
-
-    Attributes
-    ----------
-    columns, value : k design columns, and residuals as one column.
-    within : Their products within cells.
-    """
+    """Normal equations of k design columns for residuals (one column), under any covariance; `within`: products within cells."""
 
     columns: ProjectedColumns
     value: ProjectedColumns
@@ -420,8 +398,7 @@ def fit_reml(
 ) -> MeanFit:
     """Fit design columns to residuals by generalised least squares, under the most likely trial covariance.
 
-    The covariances of the reference surface's error plus noise are compared by their restricted likelihood (REML, Patterson &
-    Thompson 1971).
+    Covariances (reference error plus noise) are compared by their restricted likelihood (REML, Patterson & Thompson 1971).
 
     Parameters
     ----------
@@ -433,8 +410,7 @@ def fit_reml(
     Returns
     -------
     The fit under the most likely covariance. Only its covariance of the coefficients is an average over all trial covariances,
-    weighted by their likelihood. It includes how much the estimates differ between them, because the true covariance is not
-    known.
+    weighted by their likelihood, and includes how much the estimates differ between them: the true covariance is not known.
     """
     normal = _NormalEquations(columns, value, WithinProducts.of(columns, value))
     matrices, rights, constants = map(np.stack, zip(*map(normal.equations, covariances), strict=True))

@@ -47,6 +47,8 @@ def nonparametric_terms(
     They describe errors for which the catalogue of sensor errors has no effect. All change the observable (range, disparity or
     distance) itself, and all are functions of the standardised covariate (mean 0, standard deviation 1).
 
+    All waves are one grid of trial frequencies.
+
     Parameters
     ----------
     covariate : Name of the covariate, such as "range".
@@ -54,21 +56,16 @@ def nonparametric_terms(
     highest : Only waves below this frequency are made, in cycles per unit of the covariate, because an effect of the catalogue
         has the faster ones.
     most_cycles : Largest number of cycles of a wave over the extent of the values.
-
-    Returns
-    -------
-    The terms; all waves are one grid of trial frequencies.
     """
     x = _standardised(values)
     smooth = _spline_columns(x)
     steps = np.unique(np.quantile(x, np.linspace(0, 1, _STEPS + 2)[1:-1]))
-    waves = _wave_frequencies(x, most_cycles, highest * float(values.std()))
     return [
         _nonparametric(covariate, "line", smooth[:, :1]),
         _nonparametric(covariate, "parabola", smooth[:, :2]),
         _nonparametric(covariate, "spline", smooth),
         *(_nonparametric(covariate, "step", (x > place).astype(np.float64)[:, None]) for place in steps),
-        *(SineGrid(covariate, "amplitude", _wave(np.ones_like(x), x, tried), tried, {}, True) for tried in waves),
+        *_waves(covariate, np.ones_like(x), x, _frequencies(x, most_cycles, highest * float(values.std()))),
     ]
 
 
@@ -76,8 +73,8 @@ def angle_error_terms(angle: str, covariate: str, values: FloatArray, lever: Flo
     """Make candidate regression terms for an error of a recorded angle that varies with a covariate: line, spline and waves.
 
     An example is an error of the azimuth that varies with the zenith angle. Waves are made only if the covariate is the angle
-    itself: an unevenly divided circle may have many cycles in a field of view. Waves of the zenith angle along the azimuth are
-    left out, because the wobble effect of the catalogue has them.
+    itself: an unevenly divided circle may have many cycles in a field of view. They are one grid of trial frequencies. Waves of
+    the zenith angle along the azimuth are left out, because the wobble effect of the catalogue has them.
 
     Parameters
     ----------
@@ -85,17 +82,12 @@ def angle_error_terms(angle: str, covariate: str, values: FloatArray, lever: Flo
     covariate : Name of the covariate along which the error varies.
     values : (n,) covariate of each point.
     lever : (n,) change of the observable (range or disparity) per radian of the angle.
-
-    Returns
-    -------
-    The terms; all waves are one grid of trial frequencies.
     """
     x = _standardised(values)
     smooth = _spline_columns(x) * lever[:, None]
     forms = [_nonparametric(covariate, "line", smooth[:, :1]), _nonparametric(covariate, "spline", smooth)]
-    waves = _wave_frequencies(x, MOST_CYCLES_OF_A_SENSOR) if angle == covariate else []
-    found = [SineGrid(covariate, "amplitude", _wave(lever, x, tried), tried, {}, True, angle) for tried in waves]
-    return [*(replace(form, angle=angle) for form in forms), *found]
+    waves = _waves(covariate, lever, x, _frequencies(x, MOST_CYCLES_OF_A_SENSOR)) if angle == covariate else []
+    return [*(replace(form, angle=angle) for form in forms), *(replace(wave, angle=angle) for wave in waves)]
 
 
 def _standardised(values: FloatArray) -> FloatArray:
@@ -120,19 +112,19 @@ def robust_extent(x: FloatArray) -> float:
     return float(np.ptp(np.quantile(x, [0.005, 0.995])))
 
 
-def _wave_frequencies(x: FloatArray, most_cycles: float, highest: float = np.inf) -> list[FloatArray]:
-    """Frequencies of waves to try, as a list of one array; empty if there are fewer than two."""
+def _frequencies(x: FloatArray, most_cycles: float, highest: float = np.inf) -> FloatArray:
+    """Frequencies of waves to try."""
     reach = robust_extent(x)
-    if reach <= 0:
+    tried = frequency_grid(0.8 / reach, most_cycles / reach, 0.5 / reach) if reach > 0 else np.empty(0)
+    return tried[tried < highest]
+
+
+def _waves(covariate: str, factor: FloatArray, x: FloatArray, tried: FloatArray) -> list[SineGrid]:
+    """Make a wave in x with the frequencies `tried`, as a list of one grid; empty if there are fewer than two."""
+    if len(tried) < 2:
         return []
-    tried = frequency_grid(0.8 / reach, most_cycles / reach, 0.5 / reach)
-    tried = tried[tried < highest]
-    return [tried] if len(tried) > 1 else []
-
-
-def _wave(factor: FloatArray, x: FloatArray, tried: FloatArray) -> Wave:
-    """Make a wave for a non-parametric term in x, starting at the lowest of the frequencies `tried`."""
-    return Wave("period", factor, x, float(np.mean(x)), float(tried[0]))
+    wave = Wave("period", factor, x, float(np.mean(x)), float(tried[0]))
+    return [SineGrid(covariate, "amplitude", wave, tried, empirical=True)]
 
 
 def harmonics(covariate: str, sine: Candidate, last: int) -> Candidate:
@@ -179,20 +171,14 @@ def line_pattern_terms(covariate: str, number: FloatArray, step: float) -> list[
 def half_pixel_sine(covariate: str, disparity: FloatArray) -> list[SineGrid]:
     """Make a candidate sine with about two cycles per pixel of disparity, for interpolation errors of period half a pixel.
 
-    The sine with one cycle per pixel, pixel locking, is an effect of the catalogue and is not made here.
+    The sine with one cycle per pixel, pixel locking, is an effect of the catalogue and is not made here. The trial frequencies
+    are up to 3 % from the nominal one.
 
-    Parameters
-    ----------
-    covariate : Name of the covariate, the disparity.
-    disparity : (n,) disparities, px.
-
-    Returns
-    -------
-    One sine with trial frequencies up to 3 % from the nominal one; an empty list if all disparities are equal.
+    covariate: name of the covariate, the disparity. disparity: (n,) values, px; they must not all be equal.
     """
-    x, reach, unit = _standardised(disparity), robust_extent(disparity), float(disparity.std())
-    tried = unit * disparity_frequencies(2.0, reach)
-    return [SineGrid(covariate, "amplitude", _wave(np.ones_like(x), x, tried), tried, {}, True)] if unit else []
+    x = _standardised(disparity)
+    tried = float(disparity.std()) * disparity_frequencies(2.0, robust_extent(disparity))
+    return _waves(covariate, np.ones_like(x), x, tried)
 
 
 def polynomial_term(first: str, second: str, x: FloatArray, y: FloatArray) -> Candidate:

@@ -1,10 +1,8 @@
-"""Hold the normal equations of all candidates under every covariance of the cells' means.
+"""Hold the normal equations of all candidates under every covariance of the cells' means, to compare any sets of them quickly.
 
-With them any sets of candidates are compared quickly.
-
-There are two kinds of columns. Products of fixed columns with each other are all known. Of each searched sine only the
-    products with itself and with the held columns are known: those of the effects that others are fitted beside
-    (`with_sine_products`). A sine that is itself to be held becomes a fixed column first (`extend`).
+Products of fixed columns with each other are all known. Of each searched sine only the products with itself and with the held
+columns are known: those of the effects that others are fitted beside (`with_sine_products`). A sine that is itself to be held
+becomes a fixed column first (`extend`).
 """
 
 from __future__ import annotations
@@ -70,10 +68,6 @@ class SineProducts:
         fixed : (n, k) deviations of the other columns within cells at n points, times the inverse covariance of the noise.
         value : v columns of residuals, split into cell means and deviations within cells.
         noise : d draws of simulated noise within cells.
-
-        Returns
-        -------
-        The products of all trial sines, in the order of `grids`.
         """
         beside = np.concatenate([fixed, value.within_weighted], axis=1)
 
@@ -121,16 +115,7 @@ class SineProducts:
         return found
 
     def own_at(self, covariances: list[CellCovariance]) -> FloatArray:
-        """Return the inner products of each trial sine's two columns with each other under each of C trial covariances.
-
-        They are the diagonal part of the normal equations of the sines.
-
-        covariances: the C trial covariances of the mean residuals in the cells of the wall.
-
-        Returns
-        -------
-        (C, w, 2, 2) products for w sines.
-        """
+        """Return the (C, w, 2, 2) products of each of w sines' two columns with each other under each of C trial covariances."""
         found = np.empty((len(covariances), *self.own.shape))
         for basis, rows in _by_basis(covariances).items():
             weights = np.stack([covariances[row].weight for row in rows])
@@ -191,19 +176,11 @@ class NoiseDraws:
     def products(self, within: FloatArray, on_nodes: FloatArray) -> FloatArray:
         """Return the inner products of k design columns with d draws of simulated noise.
 
-        They are weighted by the inverse covariance of the noise, and are what noise alone adds to the right-hand side of the
-        normal equations.
+        The (k, d) products are weighted by the inverse covariance of the noise. They are what noise alone adds to the right-hand
+        side of the normal equations.
 
-        Parameters
-        ----------
-        within : (n', k) columns minus their mean (or plane) in each cell of the wall, at the n' points on which white noise is
-            drawn.
-        on_nodes : (q, k) columns projected on the q nodes of the pixel grid whose noise neighbouring points share, as
-            `WithinCellNoise.to_nodes` returns them.
-
-        Returns
-        -------
-        (k, d) products.
+        within: (n', k) columns minus their mean (or plane) in each cell of the wall, at the n' points on which white noise is
+        drawn. on_nodes: (q, k) columns projected on the q nodes of the pixel grid (`WithinCellNoise.to_nodes`).
         """
         return np.asarray(within.astype(np.float32).T @ self.white + on_nodes.T @ self.on_nodes)
 
@@ -263,32 +240,11 @@ class NormalEquations:
     wave_right: FloatArray
     held_columns: tuple[int, ...] = ()
 
-    def with_precision(self, precision: FloatArray) -> NormalEquations:
-        """Return the normal equations with a Gaussian prior of mean 0 for the coefficients of the k design columns.
-
-        precision: (k,) prior inverse variances of the coefficients; 0: no prior.
-        """
-        return replace(self, fixed=self.fixed + np.diag(precision))
-
-    def with_values(self, right: FloatArray, constant: FloatArray, wave_right: FloatArray) -> NormalEquations:
-        """Return the normal equations of the same design columns for other residuals, such as those of v simulations.
-
-        Parameters
-        ----------
-        right : (C, k, v) inner products of the new residuals with the k columns of pose and candidates, under C covariances.
-        constant : (C, v) log-likelihood of the new residuals without any column.
-        wave_right : (C, 2 w, v) inner products of the new residuals with the sine and cosine columns of w trial sines.
-        """
-        return replace(self, right=right, constant=constant, wave_right=wave_right)
-
     def with_sine_products(self, columns: list[int], products: FloatArray) -> NormalEquations:
         """Return normal equations with which sines can also be scored beside further columns, such as those of a selected effect.
 
-        Parameters
-        ----------
-        columns : Numbers of the `a` further design columns.
-        products : (C, 2 w, a) inner products of these columns with the sine and cosine columns of w trial sines, under each of C
-            trial covariances.
+        columns: numbers of the `a` further design columns. products: (C, 2 w, a) inner products of these columns with the sine
+        and cosine columns of w trial sines, under each of C trial covariances.
         """
         return replace(
             self, wave_fixed=np.concatenate([self.wave_fixed, products], axis=2), held_columns=(*self.held_columns, *columns)
@@ -311,31 +267,18 @@ class NormalEquations:
         return replace(self, covariances=at, **{name: getattr(self, name)[rows] for name in names})
 
     def log_likelihood(self, base: list[int]) -> FloatArray:
-        """Return the log-likelihoods of the model that consists of some design columns, with fitted coefficients.
+        """Return the (C, v) log-likelihoods of v columns of residuals under C trial covariances, with some columns fitted.
 
-        Parameters
-        ----------
-        base : Numbers of the columns of the model.
-
-        Returns
-        -------
-        (C, v) log-likelihoods under each of C trial covariances, for each of v columns of residuals.
+        base: numbers of the design columns of which the model consists.
         """
         right = self.right[:, base]
         return np.asarray(self.constant + 0.5 * np.einsum("ckv,ckv->cv", right, self.solved(base, right)))
 
     def solved(self, base: list[int], right: FloatArray) -> FloatArray:
-        """Solve the normal equations of some design columns under each of C trial covariances.
+        """Solve the normal equations of some design columns under each of C trial covariances for (C, b, a) coefficients.
 
-        Parameters
-        ----------
-        base : Numbers of the b columns to fit.
-        right : (C, b, a) right-hand sides: inner products of these columns with the `a` vectors that are to be fitted, such as
-            residuals, under each covariance.
-
-        Returns
-        -------
-        (C, b, a) fitted coefficients, a column for each fitted vector.
+        base: numbers of the b columns to fit. right: (C, b, a) right-hand sides: inner products of these columns with the `a`
+        vectors that are to be fitted, such as residuals, under each covariance.
         """
         matrix = self.fixed[:, base][:, :, base]
         scale = 1 / np.sqrt(np.maximum(np.einsum("ckk->ck", matrix), 1e-300))
@@ -409,7 +352,12 @@ def _explained(rest: FloatArray, own: FloatArray, left: FloatArray) -> FloatArra
 
 
 def assemble(
-    at: list[CellCovariance], fixed: ProjectedColumns, value: ProjectedColumns, within: WithinProducts, waves: SineProducts
+    at: list[CellCovariance],
+    fixed: ProjectedColumns,
+    value: ProjectedColumns,
+    within: WithinProducts,
+    waves: SineProducts,
+    precision: FloatArray,
 ) -> NormalEquations:
     """Build the normal equations of pose and candidate errors under each of C trial covariances.
 
@@ -422,6 +370,7 @@ def assemble(
     value : v columns of residuals: one of measured residuals, or several of simulated ones.
     within : Products of these columns and residuals within cells.
     waves : Inner products of the columns of w trial sines with the other columns and the residuals.
+    precision : (k,) prior inverse variances of the coefficients, whose prior is Gaussian with mean 0; 0: no prior.
 
     Returns
     -------
@@ -435,6 +384,7 @@ def assemble(
         return within.gram + basis.T @ basis, within.right + basis.T @ y, constant
 
     products, sides, constant = (np.stack(part) for part in zip(*map_in_threads(at_one, at), strict=True))
+    products += np.diag(precision)
     nothing = np.empty((len(at), len(waves.right), 0))
     return NormalEquations(at, products, sides, constant, nothing, waves.own_at(at), waves.at(at, waves.right, value.between))
 

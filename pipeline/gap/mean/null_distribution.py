@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -56,7 +56,7 @@ class NullDistribution:
             return right, constant, design.sine_products.noise + design.sine_products.between[at.basis].T @ weighted
 
         right, constant, waves = (np.stack(part) for part in zip(*map_in_threads(values, near.covariances), strict=True))
-        drawn = near.with_values(right, constant, waves)
+        drawn = replace(near, right=right, constant=constant, wave_right=waves)
         plain, fixed, searched = drawn.profile_log_likelihood(design.pose_columns, design.plain_columns)
         return cls(
             {
@@ -68,10 +68,8 @@ class NullDistribution:
     def penalty(self, family: str) -> float:
         """Return a family's penalty, which is subtracted from its log-likelihood ratio to give its score.
 
-        It is twice the mean ratio that the family reaches by chance. That is k for k linear coefficients, as in Akaike's
-        criterion (AIC), and more for a searched period.
-
-        family: name of the family, which is all variants of one candidate, such as an effect with all trial periods.
+        It is twice the mean ratio that the family (all variants of one candidate) reaches by chance. That is k for k linear
+        coefficients, as in Akaike's criterion (AIC), and more for a searched period.
         """
         return 2 * float(self.log_likelihood_ratios[family].mean())
 
@@ -79,28 +77,20 @@ class NullDistribution:
         """Return the p-value of a candidate's score: the probability that chance alone gives a score as large.
 
         The test statistic is the largest score over all families of candidates, which corrects for multiple testing. If it
-        reaches the given score in b of N simulations without effects, the p-value is (1 + b) / (1 + N). A family is one candidate
-        with all its variants, such as an effect with all trial periods.
+        reaches the given score in b of N simulations without effects, the p-value is (1 + b) / (1 + N).
 
-        Parameters
-        ----------
-        score : Penalised log-likelihood ratio of the candidate.
-        larger : For the name of each family that takes part in the test, a factor by which its simulated log-likelihood
-            ratios are multiplied; above 1 the test is stricter. None: all families, with factor 1.
+        score: penalised log-likelihood ratio of the candidate. larger: for the name of each family that takes part in the test,
+        a factor by which its simulated log-likelihood ratios are multiplied; above 1 the test is stricter. None: all families,
+        with factor 1.
         """
         return float((1 + np.sum(self._largest_scores(larger) >= score)) / (1 + NULL_DRAWS))
 
     def critical_score(self, significance: float, larger: Mapping[str, float] | None = None) -> float:
         """Return the score that a candidate must exceed for its p-value to be at most `significance`.
 
-        It is a quantile of the largest score over all families of candidates in simulations without effects. A family is one
-        candidate with all its variants, such as an effect with all trial periods.
+        It is a quantile of the largest score over all families of candidates in simulations without effects.
 
-        Parameters
-        ----------
-        significance : Largest p-value, such as 0.01.
-        larger : For the name of each family that takes part in the test, a factor by which its simulated log-likelihood
-            ratios are multiplied; above 1 the test is stricter. None: all families, with factor 1.
+        significance: largest p-value, such as 0.01. larger: factors on the simulated ratios, as for `p_value`.
         """
         allowed = max(int(significance * (1 + NULL_DRAWS) + 1e-9) - 1, 0)
         return float(np.sort(self._largest_scores(larger))[-1 - allowed])

@@ -56,17 +56,11 @@ class ProjectedColumns:
         return ProjectedColumns(within, weighed, [part[:, columns] for part in self.between])
 
     def in_bases(self, bases: list[int]) -> ProjectedColumns:
-        """Return the same design columns for only some trial correlation functions of the reference surface's error.
+        """Return the same design columns for only some trial correlation functions of the reference error, which saves time.
 
-        It saves time after unlikely functions have been dropped (`MeanModel.restrict`).
-
-        bases: indices of these functions in the list `between`, which holds the cell means for each of them.
+        bases: indices of these functions in the list `between`; `MeanModel.restrict` drops the unlikely ones.
         """
         return ProjectedColumns(self.within, self.within_weighted, [self.between[basis] for basis in bases])
-
-    def append(self, other: ProjectedColumns) -> ProjectedColumns:
-        """Return these design columns followed by those of `other`, another set of columns at the same n points."""
-        return ProjectedColumns.concatenate([self, other])
 
 
 @dataclass(frozen=True)

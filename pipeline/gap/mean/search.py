@@ -61,39 +61,27 @@ class MeanSearch:
         self._null = NullDistribution.of(self.design, random)
         self._designs: dict[tuple[Candidate, ...], Design] = {(): self.design}
         self._profiles: dict[tuple[Candidate, ...], tuple[FloatArray, ...]] = {}
-        alone = (
-            sorted(self._score_families((), {}), key=lambda each: each.log_likelihood_ratio)
-            if single_effect_ratios is None
-            else []
-        )
-        self.single_effect_ratios = single_effect_ratios or {
-            (each.name, each.empirical): each.log_likelihood_ratio for each in alone
-        }
+        if single_effect_ratios is None:
+            alone = sorted(self._score_families((), {}), key=lambda each: each.log_likelihood_ratio)
+            single_effect_ratios = {(each.name, each.empirical): each.log_likelihood_ratio for each in alone}
+        self.single_effect_ratios = single_effect_ratios
 
     def select(self) -> tuple[list[SelectedEffect], tuple[FamilyScore, ...]]:
         """Find the errors that explain the residuals, by forward selection.
 
-        Returns
-        -------
-        The selected errors; and the scores of all families of candidates beside them, best first. A family is all variants of
-        one candidate, such as an effect with all trial periods.
+        It returns the selected errors, and the scores of all families of candidates beside them, best first. A family is all
+        variants of one candidate, such as an effect with all trial periods.
         """
         found = ForwardSelection(self).select()
         self._designs = {(): self.design}  # frees memory: each conditioned design is as large as the search itself
         return found
 
     def score_families(self, members: EffectSet) -> tuple[FamilyScore, ...]:
-        """Score every family of candidate errors as an addition to a model.
+        """Score every family of candidate errors as an addition to a model, by its best variant; the best score comes first.
 
         A family is the set of all variants of one candidate, such as an effect with all trial periods.
 
-        Parameters
-        ----------
-        members : The errors that are in the model already; may be empty.
-
-        Returns
-        -------
-        For each family the score of its best variant, best score first.
+        members: the errors that are in the model already; may be empty.
         """
         return self._score_families(members, self.single_effect_ratios)
 
@@ -104,7 +92,7 @@ class MeanSearch:
         for name, (rows, sines) in families.by_name.items():
             ratios = np.concatenate([fixed[rows, 0], searched[sines, 0]]) - plain[0]
             best = int(np.argmax(ratios))
-            candidate = families.plain[rows[best]] if best < len(rows) else families.sine(sines[best - len(rows)])
+            candidate = families.plain[rows[best]] if best < len(rows) else families.sines[sines[best - len(rows)]]
             ratio = float(ratios[best])
             negligible = ratio < thresholds().mean.class_share * alone.get((candidate.name, candidate.empirical), 0.0)
             found.append(
@@ -143,14 +131,8 @@ class MeanSearch:
         wall, where no sensor has an axis. The null distribution of all sinusoidal candidates is stretched by that factor
         (genomic control, Devlin & Roeder 1999).
 
-        Parameters
-        ----------
-        family_scores : Scores of all further candidates beside the selected errors, as `select` returns them. A family is a
-            candidate with its variants, such as a sine with all its periods.
-
-        Returns
-        -------
-        The p-value; None if no candidate remains to be tested.
+        family_scores: scores of all further candidates beside the selected errors, as `select` returns them; without any, there
+        is no p-value.
         """
         scores = [item.score for item in family_scores if not item.name.startswith(SPATIAL_NULL)]
         return self._null.p_value(max(scores), self._discounts(family_scores)) if scores else None
@@ -192,17 +174,10 @@ class MeanSearch:
     def spatial_null_p_value(self, family_scores: Sequence[FamilyScore]) -> float | None:
         """Test whether the reference surface errs more than its error model allows.
 
-        The test uses the spatial null candidates: lines, waves and other terms along oblique directions on the wall. No sensor
-        has an axis there, so only the reference's error can explain them.
+        The p-value is that of the best spatial null candidate: a line, wave or other term along an oblique direction on the wall.
+        No sensor has an axis there, so only the reference's error can explain it. None if there are no such candidates.
 
-        Parameters
-        ----------
-        family_scores : Scores of all candidates beside the selected errors, spatial null candidates included, as `select` returns
-            them.
-
-        Returns
-        -------
-        The p-value of the best score of a spatial null candidate; None if there are no such candidates.
+        family_scores: scores of all candidates beside the selected errors, as `select` returns them.
         """
         scores = [item.score for item in family_scores if item.name.startswith(SPATIAL_NULL)]
         places = [name for name in self.design.families.by_name if name.startswith(f"free {SPATIAL_NULL}")]
@@ -228,14 +203,7 @@ class MeanSearch:
         if that fits as well. Among patterns that repeat every few scan lines, columns or rows, the one with the fewest lines
         is taken, because multiples of it fit as well. Other terms are returned unchanged.
 
-        Parameters
-        ----------
-        members : The other errors in the model, fitted jointly.
-        form : The term, such as a wave along a covariate, with its score.
-
-        Returns
-        -------
-        The term in its best form, with its score.
+        members: the other errors in the model, fitted jointly. form: the term, such as a wave along a covariate, with its score.
         """
         if form.candidate.form.startswith(LINE_PATTERN):
             return self._of_fewest_lines(members, form)
@@ -245,20 +213,19 @@ class MeanSearch:
 
     def _of_fewest_lines(self, members: EffectSet, form: FamilyScore) -> FamilyScore:
         """Return the pattern with the fewest scan lines a cycle among those whose score is nearly that of `form`."""
-        patterns = [
-            each
-            for each in self.score_families(members)
-            if each.candidate.form.startswith(LINE_PATTERN) and each.name == form.name
-        ]
-        good = [each for each in patterns if each.score > form.score - thresholds().mean.class_margin]
-        return min(good, key=lambda each: each.candidate.period)
+        least = form.score - thresholds().mean.class_margin
+        alike = (each for each in self.score_families(members) if each.name == form.name and each.score > least)
+        return min(
+            (each for each in alike if each.candidate.form.startswith(LINE_PATTERN)), key=lambda each: each.candidate.period
+        )
 
     def _wave_instead(self, members: EffectSet, form: FamilyScore) -> FamilyScore:
         """Return the wave of the same covariate with refined period if it scores better than the spline `form`, else `form`."""
-        waves = [each for each in self.score_families(members) if each.candidate.form == "wave" and _same_covariate(each, form)]
-        if not waves:
+        family = replace(form.candidate, form="wave").family
+        wave = next((each for each in self.score_families(members) if each.candidate.family == family), None)
+        if wave is None:
             return form
-        wave, others = waves[0], [member.candidate for member in members]
+        others = [member.candidate for member in members]
         (sine, *_), fit = self.design.fit_refined([wave.candidate, *others])
         ratio = wave.log_likelihood_ratio + fit.log_likelihood - self.design.fit([wave.candidate, *others]).log_likelihood
         score = ratio - (wave.log_likelihood_ratio - wave.score)
@@ -283,16 +250,13 @@ class MeanSearch:
         return best if best.score >= form.score + thresholds().variance.least_gain else form
 
     def fitted_std(self, item: FamilyScore) -> float:
-        """Return how large a candidate error is: the standard deviation of its fitted values over the points.
+        """Return how large a candidate error is: the standard deviation of its fitted values over the points, m (or px).
 
-        The fit has the candidate and the pose of the sensor, and no other candidate. The result is in the unit of the
-        observable (m, or px of disparity).
-
-        item: the candidate with its score.
+        item: the candidate with its score; it is fitted with the pose of the sensor, and without any other candidate.
         """
-        candidates, fit = self.design.fit_refined([item.candidate])
-        columns = candidates[0].columns
-        return float(np.std(columns @ self.design.split_coefficients(fit.coefficients, candidates)[0][: columns.shape[1]]))
+        (candidate,), fit = self.design.fit_refined([item.candidate])
+        (values,) = self.design.split_coefficients(fit.coefficients, [candidate])
+        return float(np.std(candidate.columns @ values[: candidate.columns.shape[1]]))
 
     def effect_variants(self) -> list[Candidate]:
         """List the sensor errors of the catalogue, once for each camera that can have them, those that explain most first.
@@ -308,12 +272,8 @@ class MeanSearch:
     def leading_effects(self) -> list[Candidate]:
         """List the sensor errors that explain the most on their own, which are worth refitting without linearisation.
 
-        They are effects of the catalogue; sines of unknown period are not included. Each reaches at least the log-likelihood
-        ratio `mean.refit_gain`, and at least the share `mean.refit_share` of the largest ratio (thresholds).
-
-        Returns
-        -------
-        At most eight candidates, best first.
+        They are at most eight effects of the catalogue, best first; sines of unknown period are not included. Each reaches at
+        least the log-likelihood ratio `mean.refit_gain`, and the share `mean.refit_share` of the largest ratio (thresholds).
         """
         ranked = self._ranked_variants()
         least = max(thresholds().mean.refit_share * ranked[0][0], thresholds().mean.refit_gain) if ranked else 0.0
@@ -324,8 +284,7 @@ class MeanSearch:
 
         Of variants that differ only in a trial value, such as a limit, the best one stands for all.
         """
-        found = [item for item in self._ratios_alone() if not item[1].empirical]
-        ascending = sorted(found, key=lambda item: item[0])
+        ascending = sorted((item for item in self._ratios_alone() if not item[1].empirical), key=lambda item: item[0])
         best = {(each.name, each.names, each.fixed.get("camera")): (ratio, each) for ratio, each in ascending}
         return sorted(best.values(), key=lambda item: -item[0])
 
@@ -352,8 +311,3 @@ class MeanSearch:
         best = next(item for item in self.score_families(()) if item.name == candidate.name and not item.empirical)
         item = replace(best, candidate=candidate)
         return ForwardSelection(self).with_equivalents((item,), item, {})
-
-
-def _same_covariate(one: FamilyScore, other: FamilyScore) -> bool:
-    """Whether two terms have the same covariate and the same angle."""
-    return one.name == other.name and one.candidate.angle == other.candidate.angle

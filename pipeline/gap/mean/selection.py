@@ -116,19 +116,17 @@ class _Set:
         It must clearly beat the spatial null candidates if its covariate varies along the wall.
         """
         null_score = self.spatial_null_score
-        terms = [
-            item for item in self.family_scores if item.empirical and not (item.negligible or item.name.startswith(SPATIAL_NULL))
-        ]
-        found = [item for item in terms if _beats_spatial_null(item, null_score)]
+        terms = (item for item in self.family_scores if item.empirical and not item.name.startswith(SPATIAL_NULL))
+        found = [item for item in terms if not item.negligible and _beats_spatial_null(item, null_score)]
         one_covariate = next((item for item in found if item.candidate.form != POLYNOMIAL), None)
         if one_covariate is None or found[0].score > one_covariate.score + thresholds().variance.least_gain:
             return found[0] if found else None
         return one_covariate
 
 
-def _replacements(names: frozenset[str], name: str, margin: float, scores: SetScores) -> list[str]:
+def _replacements(names: set[str], name: str, margin: float, scores: SetScores) -> list[str]:
     """Names of effects that could replace `name` in the set `names` at nearly the same joint score, best first."""
-    others, least = names - {name}, scores.get(names, math.inf) - margin
+    others, least = names - {name}, scores.get(frozenset(names), math.inf) - margin
     as_good = [each for each, score in scores.items() if others < each and len(each) == len(names) and score > least]
     return [other for each in sorted(as_good, key=lambda each: -scores[each]) for other in each - others if other != name]
 
@@ -136,11 +134,6 @@ def _replacements(names: frozenset[str], name: str, margin: float, scores: SetSc
 def _least_nonparametric_score() -> float:
     """Return the score that a non-parametric term needs: `variance.least_gain` against the reference, and against effects."""
     return 2 * thresholds().variance.least_gain
-
-
-def _unreported_score(form: FamilyScore | None) -> float:
-    """Score of a non-parametric term that is too weak to be reported, which a weak effect must still beat; else 0."""
-    return form.score if form is not None and form.score < _least_nonparametric_score() else 0.0
 
 
 def _beats_spatial_null(item: FamilyScore, null_score: float) -> bool:
@@ -160,36 +153,20 @@ class CandidateScorer(Protocol):
     def score_families(self, members: EffectSet) -> tuple[FamilyScore, ...]:
         """Score each family of candidate errors by its best variant, in addition to errors that are in a model already.
 
-        A family is the set of all variants of one candidate, such as an effect with different cameras or periods.
-
-        members: the errors in the model; may be empty.
-
-        Returns
-        -------
-        Penalised log-likelihood ratios (see `FamilyScore`), the best family first.
+        A family is the set of all variants of one candidate, such as an effect with different cameras or periods. The best one
+        comes first. members: the errors in the model; may be empty.
         """
 
     def p_value(self, score: float) -> float:
-        """Return the p-value of a score: the probability that the best of all candidate errors scores as much by chance.
-
-        score: penalised log-likelihood ratio of the candidate.
-        """
+        """Return the probability that the best of all candidate errors has such a penalised log-likelihood ratio by chance."""
 
     def joint_score(self, members: EffectSet) -> float:
-        """Return the score of several errors together: their joint log-likelihood ratio minus the penalty of each.
-
-        members: the errors; the periods of sines among them are refined first.
-        """
+        """Return the score of several errors together: their joint log-likelihood ratio minus the penalty of each."""
 
     def with_harmonics(self, members: EffectSet, form: FamilyScore) -> FamilyScore:
-        """Replace a non-parametric term that describes a periodic error by its best periodic form, to name the error's shape.
+        """Replace a non-parametric term that describes a periodic error by its best periodic form, such as a wave with overtones.
 
-        For example, a spline along a covariate becomes a wave with overtones.
-
-        Parameters
-        ----------
-        members : Other errors in the model, fitted jointly.
-        form : The term with its score; one that is not periodic is returned unchanged.
+        members: other errors in the model, fitted jointly. form: the term; one that is not periodic is returned unchanged.
         """
 
 
@@ -223,25 +200,16 @@ class ForwardSelection:
                 break
             levels.append(grown)
             scores |= of_sets
-        best = levels[-1][0]
-        members, form = self._nonparametric_term(levels) or ((), None)
-        if form is not None:
-            form = self.search.with_harmonics(members, form)
-            chosen = [self.with_equivalents(members, item, scores) for item in members]
-            chosen.append(
-                SelectedEffect(
-                    form.candidate,
-                    (),
-                    self.search.p_value(form.score),
-                    form.log_likelihood_ratio,
-                    form.score,
-                    empty.family_scores,
-                )
-            )
+        if (found := self._nonparametric_term(levels)) is not None:
+            members, form = found[0], self.search.with_harmonics(*found)
+            p_value, ratio = self.search.p_value(form.score), form.log_likelihood_ratio
+            term = SelectedEffect(form.candidate, (), p_value, ratio, form.score, empty.family_scores)
+            chosen = [*(self.with_equivalents(members, item, scores) for item in members), term]
             return chosen, self.search.score_families((*members, form))
-        best, chosen = self._drop_below_spatial_null(best, scores)
-        nearly = (1 - thresholds().mean.class_share) * empty.spatial_null_score
-        if best.score <= max(nearly, _unreported_score(empty.nonparametric)):  # no effect of the catalogue explains it as well
+        best, chosen = self._drop_below_spatial_null(levels[-1][0], scores)
+        nearly, weak = (1 - thresholds().mean.class_share) * empty.spatial_null_score, empty.nonparametric
+        unreported = weak.score if weak is not None and weak.score < _least_nonparametric_score() else 0.0
+        if best.score <= max(nearly, unreported):  # no effect of the catalogue explains it as well
             return [], empty.family_scores
         return chosen, best.family_scores
 
@@ -273,24 +241,15 @@ class ForwardSelection:
 
         None if the data require none.
         """
-        best, empty = levels[-1][0], levels[0][0]
-        if (
-            best.nonparametric is not None
-            and best.nonparametric.score >= _least_nonparametric_score()
-            and self._significant(best.nonparametric.score)
-        ):
-            found: tuple[_Set, FamilyScore] | None = None
-            for state in (level[0] for level in levels):
-                form = state.nonparametric
-                if form is None:
-                    continue
-                if found is None or self._effects_required(
-                    state, state.score + form.score - found[0].score - found[1].score, found[1]
-                ):
-                    found = state, form
-            if found is not None:
-                return found[0].members, found[1]
-        alone = empty.nonparametric
+        best, alone = levels[-1][0], levels[0][0].nonparametric
+        last = best.nonparametric
+        if last is not None and last.score >= _least_nonparametric_score() and self._significant(last.score):
+            terms = [(state, form) for state, *_ in levels if (form := state.nonparametric) is not None]
+            found, term = terms[0]
+            for state, form in terms[1:]:
+                if self._effects_required(state, state.score + form.score - found.score - term.score, term):
+                    found, term = state, form
+            return found.members, term
         if not best.members or alone is None:
             return None
         score = max(best.score, self.search.joint_score(best.members))
@@ -320,23 +279,18 @@ class ForwardSelection:
         ----------
         among : The selected set of effects.
         item : The effect to describe, a member of the set.
-        scores : Joint score of each set of effects that was tried; the key is the names of its effects. A set that scores nearly
-            as well as the selected one tells which effect could replace `item`.
+        scores : Joint score of each set of effects that was tried, by the names of its effects. A set that scores nearly as well
+            as the selected one tells which effect could replace `item`.
         """
         others = tuple(member for member in among if member is not item)
-        beside = [
-            each
-            for each in self.search.score_families(others)
-            if not each.empirical and each.name not in {o.name for o in others}
-        ]
+        tried, names = self.search.score_families(others), {member.name for member in others}
+        beside = [each for each in tried if not each.empirical and each.name not in names]
         mine = next(each for each in beside if each.name == item.name)
-        margin, p_value = equivalence_margin(mine.log_likelihood_ratio), self.search.p_value(mine.score)
-        indistinguishable = [each.name for each in beside if each is not mine and each.score > mine.score - margin]
-        indistinguishable += _replacements(frozenset(member.name for member in among), item.name, margin, scores)
-        tried = self.search.score_families(others)
-        return SelectedEffect(
-            item.candidate, tuple(dict.fromkeys(indistinguishable)), p_value, mine.log_likelihood_ratio, mine.score, tried
-        )
+        ratio, p_value = mine.log_likelihood_ratio, self.search.p_value(mine.score)
+        margin = equivalence_margin(ratio)
+        alike = [each.name for each in beside if each is not mine and each.score > mine.score - margin]
+        alike += _replacements(names | {item.name}, item.name, margin, scores)
+        return SelectedEffect(item.candidate, tuple(dict.fromkeys(alike)), p_value, ratio, mine.score, tried)
 
     def _significant(self, score: float) -> bool:
         """Tell whether a score is significant."""

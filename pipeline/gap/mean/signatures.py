@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from functools import partial
+from itertools import product
 from typing import Any
 
 import numpy as np
@@ -18,7 +19,6 @@ from pipeline.gap.mean.candidates import (
     Wave,
     amplitude_and_phase,
     disparity_frequencies,
-    expand_grids,
     frequency_grid,
 )
 from pipeline.gap.residuals.disparity_raster import apply_smoothing, raster_spacing_px
@@ -48,15 +48,12 @@ _REDUCTIONS = (1.0, 2.0, 4.0, 8.0)
 def systematic_candidates(residuals: Residuals, measurement: Measurement) -> list[Candidate]:
     """List every systematic sensor error of the catalogue that this kind of measurement can have, as regression terms.
 
-    An error's design columns are the change of the residuals per unit of its parameters. Each camera and each trial period is
-    a candidate of its own. Errors that depend on data which were not recorded, such as the intensity, are left out.
+    It lists the errors of `systematic_families`, but each trial period is a candidate of its own.
 
-    Parameters
-    ----------
-    residuals : Residuals of the points, with the geometry of their rays or pixels.
-    measurement : The measurement. Its sensor model must be the one with which the residuals were computed.
+    residuals: residuals of the points. measurement: the measurement, with the sensor model with which they were computed.
     """
-    return expand_grids(systematic_families(residuals, measurement))
+    families = systematic_families(residuals, measurement)
+    return [each for family in families for each in (family.candidates if isinstance(family, SineGrid) else [family])]
 
 
 def systematic_families(residuals: Residuals, measurement: Measurement) -> list[Candidate | SineGrid]:
@@ -66,10 +63,7 @@ def systematic_families(residuals: Residuals, measurement: Measurement) -> list[
     own, and a sine of unknown period is one `SineGrid` of trial frequencies. Errors that depend on data which were not
     recorded, such as the intensity, are left out.
 
-    Parameters
-    ----------
-    residuals : Residuals of the points, with the geometry of their rays or pixels.
-    measurement : The measurement. Its sensor model must be the one with which the residuals were computed.
+    residuals: residuals of the points. measurement: the measurement, with the sensor model with which they were computed.
     """
     geometry = residuals.geometry
     possible = [effect for effect in residuals.candidates if effect is not TileShift]  # its seams are found before, by themselves
@@ -91,13 +85,8 @@ def _families(effect: type[Effect], geometry: Geometry, fixed: dict[str, Any]) -
         yield from _searched(effect, effect.searched, geometry, fixed)
     elif _PHASE in effect.model_fields:
         (amplitude,) = effect.typical_sizes()
-        yield Candidate(
-            effect.tag(),
-            _sine_and_cosine(effect, geometry, fixed),
-            lambda values: amplitude_and_phase(values, amplitude) | fixed,
-            (amplitude, _PHASE),
-            fixed,
-        )
+        named = partial(amplitude_and_phase, amplitude=amplitude)
+        yield Candidate(effect.tag(), _sine_and_cosine(effect, geometry, fixed), named, (amplitude, _PHASE), fixed)
     else:
         sizes = effect.typical_sizes()
         limit, tried = effect.trials or ("", ())
@@ -139,9 +128,7 @@ def _shortest(search: Search, geometry: Geometry) -> float:
     return search.shortest if step is None else max(search.shortest, 2 * step)
 
 
-def _of_cameras(
-    effects: list[type[CameraEffect]], geometry: PixelGeometry, measurement: StereoMeasurement
-) -> list[Candidate | SineGrid]:
+def _of_cameras(effects: list[type[CameraEffect]], geometry: PixelGeometry, measurement: StereoMeasurement) -> list[Candidate]:
     """Return the candidates of camera effects; their columns are finite differences of the pair's disparities."""
     nominal = NominalPair.of(measurement)
     sets = {effect: effect.sets or (tuple(effect.nulls()),) for effect in effects}
@@ -156,18 +143,12 @@ def _of_cameras(
     changes = np.stack([(each - base) / step for (*_, step), each in zip(varied, seen, strict=True)], axis=1)
     passed = apply_smoothing(measurement.model.effects, geometry, changes)
     columns = {(effect, side, key): column for (effect, side, key, _), column in zip(varied, passed.T, strict=True)}
-    return [
-        Candidate(
-            effect.tag(),
-            np.stack([columns[effect, side, key] for key in keys], axis=1),
-            partial(_by_name, keys),
-            keys,
-            {"camera": side},
-        )
-        for effect in effects
-        for side in _SIDES
-        for keys in sets[effect]
-    ]
+    found = []
+    for effect, side in product(effects, _SIDES):
+        for keys in sets[effect]:
+            matrix = np.stack([columns[effect, side, key] for key in keys], axis=1)
+            found.append(Candidate(effect.tag(), matrix, partial(_by_name, keys), keys, {"camera": side}))
+    return found
 
 
 def _by_name(names: tuple[str, ...], values: FloatArray) -> dict[str, float]:
@@ -190,14 +171,8 @@ def _locking(geometry: PixelGeometry) -> list[SineGrid]:
     The rectification in which the disparities were computed is not known: its principal distance (the period) is uncertain by
     some percent, its offset (the phase) entirely. If the matcher's noise is locked too, little of the mean error is left.
     """
-    reach = float(np.ptp(np.quantile(geometry.disparity, [0.01, 0.99])))
-    one = np.ones_like(geometry.disparity)
-    return [
-        SineGrid(
-            PixelLocking.tag(),
-            "amplitude_px",
-            Wave("period_px", one, geometry.disparity, float(np.mean(geometry.disparity)), float(tried[0])),
-            tried,
-        )
-        for tried in (disparity_frequencies(1 / reduction, reach) for reduction in _REDUCTIONS)
-    ]
+    x = geometry.disparity
+    reach, middle = float(np.ptp(np.quantile(x, [0.01, 0.99]))), float(np.mean(x))
+    frequencies = (disparity_frequencies(1 / reduction, reach) for reduction in _REDUCTIONS)
+    waves = ((Wave("period_px", np.ones_like(x), x, middle, float(tried[0])), tried) for tried in frequencies)
+    return [SineGrid(PixelLocking.tag(), "amplitude_px", wave, tried) for wave, tried in waves]

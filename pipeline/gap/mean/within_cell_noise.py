@@ -1,9 +1,4 @@
-"""Model the noise of deviations within cells: white noise and grid-correlated noise.
-
-In units of the predicted sigma the deviations have the covariance R = w I + Z C Z', with w the share of white noise, C the
-covariance of the values at q nodes, and Z (n, q) their weights minus the cells' means. By Woodbury's identity
-R^-1 = (I - Z K^-1 Z') / w with K = w C^-1 + Z'Z, so products with R^-1 only need q x q matrices.
-"""
+"""Model the noise of deviations within cells: white noise and grid-correlated noise."""
 
 from __future__ import annotations
 
@@ -27,8 +22,8 @@ class WithinCellNoise:
 
     A stereo matcher has noise that neighbouring points share. It is modelled as random values at q nodes of a pixel grid,
     interpolated bilinearly. In units of sigma, the standard deviation of each point, the covariance is R = w I + Z C Z': white
-    noise, plus node values with covariance C. Z are the bilinear weights over sigma, minus their cell means. The inverse only
-    needs (q, q) matrices: R^-1 = (I - Z K^-1 Z') / w with K = w C^-1 + Z'Z.
+    noise, plus node values with covariance C. Z are the bilinear weights over sigma, minus their cell means. By Woodbury's
+    identity the inverse only needs (q, q) matrices: R^-1 = (I - Z K^-1 Z') / w with K = w C^-1 + Z'Z.
 
     Attributes
     ----------
@@ -65,10 +60,7 @@ class WithinCellNoise:
         return cls(white, nodes, means, field.root, cholesky(matrix, lower=True))
 
     def mean_covariance(self) -> FloatArray:
-        """Return the (m, m) covariance of the noise in the means of m cells of the wall.
-
-        Its unit is the variance that white noise alone gives the mean of each cell; off the diagonal is what cells share.
-        """
+        """Return the (m, m) covariance of the noise in the means of m wall cells, over the variance from white noise alone."""
         shared = self.means @ self.prior
         return np.asarray(self.white * np.eye(len(shared)) + shared @ shared.T)
 
@@ -78,59 +70,38 @@ class WithinCellNoise:
         return self.nodes.shape[1] == 0
 
     def to_nodes(self, columns: FloatArray, means: FloatArray | None = None) -> FloatArray:
-        """Project k design columns on the q nodes of the pixel grid whose noise neighbouring points share.
+        """Project k design columns on the q nodes of the pixel grid whose noise neighbouring points share: Z' times the columns.
 
-        It is the first step of weighting the columns by the inverse covariance of the noise. They are multiplied by Z': Z
-        holds the bilinear weights with which the noise at the nodes acts on the n points, minus their means in each wall cell.
+        It is the first step of weighting the columns by the inverse covariance of the noise. Z holds the bilinear weights with
+        which the noise at the nodes acts on the n points, minus their means in each wall cell. The products are (q, k).
 
-        Parameters
-        ----------
-        columns : (n, k) columns, divided by the standard deviation of each point.
-        means : (m, k) their means in the m cells; None if cell means are subtracted from the columns already.
-
-        Returns
-        -------
-        (q, k) products.
+        columns: (n, k) columns, divided by the standard deviation of each point. means: (m, k) their means in the m cells; None
+        if cell means are subtracted from the columns already.
         """
         found = np.asarray(self.nodes.T @ columns)
         return found if means is None else found - self.means.T @ means
 
     def solve(self, on_nodes: FloatArray) -> FloatArray:
-        """Solve K a = b for k columns over the q nodes of the pixel grid: a step of weighting columns by the inverse of R.
+        """Solve K a = b for k columns over the q nodes of the pixel grid: a step of weighting columns by R^-1 (see the class).
 
-        R = w I + Z C Z' is the covariance of the noise within wall cells. The share of white noise is w. The noise at the
-        nodes has the covariance C and acts on the n points by the weights Z (n, q). The inverse of R is (I - Z K^-1 Z') / w with
-        K = w C^-1 + Z'Z.
-
-        on_nodes: (q, k) columns b: design columns projected on the nodes by `to_nodes`.
-
-        Returns
-        -------
-        (q, k) columns a.
+        on_nodes: (q, k) columns b: design columns projected on the nodes by `to_nodes`. The columns a are returned, (q, k).
         """
         return np.asarray(cho_solve((self.root, True), on_nodes)) if len(self.root) else on_nodes
 
     def whiten(self, on_nodes: FloatArray) -> FloatArray:
-        """Transform k columns b over the q nodes of the pixel grid to a = L^-1 b, so that a' a = b' K^-1 b.
+        """Transform k columns b over the q nodes of the pixel grid to a = L^-1 b with K = L L', so that a' a = b' K^-1 b.
 
-        It serves inner products of design columns that are weighted by the inverse of R, where R = w I + Z C Z' is the covariance
-        of the noise within wall cells. The share of white noise is w. The noise at the nodes has the covariance C and acts on the
-        n points by the weights Z (n, q). The inverse of R is (I - Z K^-1 Z') / w with K = w C^-1 + Z'Z = L L'.
+        It serves inner products of design columns that are weighted by the inverse covariance R^-1 of the noise (see the class).
 
-        on_nodes: (q, k) columns b: design columns projected on the nodes by `to_nodes`.
-
-        Returns
-        -------
-        (q, k) columns a.
+        on_nodes: (q, k) columns b: design columns projected on the nodes by `to_nodes`. The columns a are returned, (q, k).
         """
         return np.asarray(solve_triangular(self.root, on_nodes, lower=True)) if len(self.root) else on_nodes
 
     def draw(self, white: FloatArray, rows: slice, cell_sums: FloatArray, random: KeyedRandom) -> FloatArray:
         """Simulate noise that neighbouring points share, in a form that quickly gives its effect on any fitted coefficient.
 
-        The noise r = sqrt(w) e + Z v of n points consists of white noise e, whose share of the variance is w, and of values v
-        at the q nodes of a pixel grid, interpolated by the weights Z (n, q). With the covariance C of v, the covariance of r is
-        R = w I + Z C Z'. Its effect on the coefficient of a design column c (n,) follows from the inner product
+        The noise r = sqrt(w) e + Z v of n points has the covariance R of the class. It consists of white noise e and of values v
+        at the q nodes of a pixel grid. Its effect on the coefficient of a design column c (n,) follows from the inner product
 
             c' R^-1 r = c' e / sqrt(w) + (Z' c)' f,  with  f = K^-1 (C^-1 v - Z' e / sqrt(w))  and  K = w C^-1 + Z'Z.
 
@@ -143,10 +114,6 @@ class WithinCellNoise:
         cell_sums : (m, d) means of these draws in the m cells of the wall, divided by their standard deviations. They are needed
             because cell means are subtracted from the weights Z.
         random : Source of the random numbers for v.
-
-        Returns
-        -------
-        (q, d) vectors f, one for each draw.
         """
         own = random.generator().standard_normal((len(self.root), white.shape[1]))
         if not self.is_white:

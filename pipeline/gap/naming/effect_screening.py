@@ -23,35 +23,37 @@ _REFINING_STEPS = 5
 """Most Gauss-Newton steps by which the size of an effect is refined."""
 
 
-def gauss_newton_step(at: Residuals, columns: FloatArray, precision: FloatArray, values: FloatArray) -> FloatArray:
+def all_columns(candidates: Sequence[Candidate]) -> FloatArray:
+    """Return the design columns of some sensor errors (regression terms) side by side, as an array with n rows."""
+    return np.asarray(np.concatenate([each.columns for each in candidates], axis=1))
+
+
+def gauss_newton_step(at: Residuals, candidates: Sequence[Candidate], values: FloatArray | None = None) -> FloatArray:
     """Compute by how much a Gauss-Newton step changes the sizes of sensor errors (effects), with the sensor's pose free.
 
     Parameters
     ----------
     at : residuals of n points with the effects at their present sizes in the model.
-    columns : (n, k) derivatives of the residuals by the k sizes.
-    precision : (k,) inverse variances of the sizes' Gaussian priors, which have mean 0.
-    values : (k,) present sizes.
+    candidates : the effects as regression terms; their n design columns are the derivatives of the residuals by the k sizes.
+    values : (k,) present sizes, of which large ones are held back by the priors; None: all 0.
 
     Returns
     -------
     FloatArray : (k,) changes of the sizes.
     """
-    design = np.concatenate([at.pose_jacobian, columns], axis=1) / at.sigma[:, None]
-    known, pull = np.zeros(design.shape[1]), np.zeros(design.shape[1])
     start = at.pose_jacobian.shape[1]
-    known[start:], pull[start:] = precision, precision * values
-    found = np.linalg.solve(design.T @ design + np.diag(known), design.T @ (at.value / at.sigma) - pull)
-    return np.asarray(found[start:])
+    design = np.concatenate([at.pose_jacobian, all_columns(candidates)], axis=1) / at.sigma[:, None]
+    known = np.concatenate([np.zeros(start), *(prior_precision(each, each.columns.shape[1]) for each in candidates)])
+    right = design.T @ (at.value / at.sigma)
+    if values is not None:
+        right[start:] -= known[start:] * values
+    return np.asarray(np.linalg.solve(design.T @ design + np.diag(known), right)[start:])
 
 
 def estimate_of_size(candidate: Candidate, values: FloatArray) -> Estimate:
     """Describe a sensor error (effect) of a given size as an estimate, without any evidence for it.
 
-    Parameters
-    ----------
-    candidate : the effect as a regression term.
-    values : (k,) coefficients of its k design columns.
+    candidate: the effect as a regression term. values: (k,) coefficients of its k design columns.
     """
     nothing = SelectedEffect(candidate, (), 1.0, 0.0, 0.0, ())
     return Estimate(nothing, candidate, values, np.zeros((len(values), len(values))))
@@ -117,16 +119,13 @@ class _ScreenedEffect:
     @classmethod
     def of_one_step(cls, measurement: Measurement, part: Residuals, candidate: Candidate) -> _ScreenedEffect | None:
         """Put an effect into the model of n points, at the size of one Gauss-Newton step; None if that is implausible."""
-        width = candidate.columns.shape[1]
-        size = gauss_newton_step(part, candidate.columns, prior_precision(candidate, width), np.zeros(width))
-        return cls.of(measurement, part, estimate_of_size(candidate, size))
+        return cls.of(measurement, part, estimate_of_size(candidate, gauss_newton_step(part, [candidate])))
 
     def improved(self, measurement: Measurement, part: Residuals) -> _ScreenedEffect | None:
         """Change the size by a Gauss-Newton step, computed without the outliers; None if this does not reduce the noise left."""
         z = self.value / self.residuals.sigma
         good = self.residuals.usable & (np.abs(z) < thresholds().points.outlier_sigmas * max(nmad(z, 0.0), 1.0))
         at, candidate = self.residuals.part(good), self.estimate.candidate
-        columns = candidate.columns[at.index]
-        step = gauss_newton_step(at, columns, prior_precision(candidate, columns.shape[1]), self.estimate.values)
+        step = gauss_newton_step(at, [candidate.part(at.index)], self.estimate.values)
         found = _ScreenedEffect.of(measurement, part, estimate_of_size(candidate, self.estimate.values + step))
         return found if found is not None and found.noise_left < self.noise_left else None

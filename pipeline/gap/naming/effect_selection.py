@@ -101,15 +101,9 @@ class SelectionResult:
         """Return the p-value of the misfit that is left when the sensor model holds only some of the selected effects.
 
         It serves the verdict after validation has dropped effects. The p-values with all selected systematic effects and with
-        none of them are known; for a part of them it is computed.
+        none of them are known; for a part of them it is computed. None if nothing was left to try, or if it cannot be computed.
 
-        Parameters
-        ----------
-        named : effects that are kept.
-
-        Returns
-        -------
-        float or None : the p-value; None if nothing was left to try, or if it cannot be computed.
+        named: effects that are kept.
         """
         kept = self.systematic & {item.name for item in named}
         if kept == self.systematic:
@@ -160,17 +154,12 @@ def select_effects(given: SelectionInput) -> tuple[list[NamedEffect], SelectionR
     A linearised search finds systematic effects. They are put into the sensor model, residuals are computed again, and further
     effects are searched. Strong effects are refitted without linearising. Noise terms are fitted to the remaining residuals and
     weight the next search. If the fitted value of an effect is implausible, the effect is excluded, and the selection is
-    repeated.
+    repeated. The effects that were found are returned, and the scores and tests of the selection.
 
     given : residuals of the training points, and what is not tried.
-
-    Returns
-    -------
-    tuple : the effects that were found, and the scores and tests of the selection.
     """
     measurement, random = given.measurement, given.random
-    tiles = _shifted_tiles(given)
-    if tiles is not None:
+    if (tiles := _shifted_tiles(given)) is not None:
         return _select_beside_tiles(given, tiles)
     apart = _FoundApart.of(given)
     part = with_added_variance(given.part, apart.variance)
@@ -182,7 +171,7 @@ def select_effects(given: SelectionInput) -> tuple[list[NamedEffect], SelectionR
     search = SearchInput(measurement, part, families, partial(_noise_terms_at, given, part), apart.variance, random)
     first = MeanSearch(with_fitted_variance(part, noise.terms or known, apart.noise_ratio), families, random)
     found = select_and_refit(search, first)
-    names, _, survival = first.design.identifiability()
+    names, _, survival = first.design.identifiability
     wrong = _implausible_effects(given, found, dict(zip(names, survival, strict=True)))
     design = found.search.design
     left = design.residuals_after([each.candidate for each in found.further])
@@ -334,15 +323,15 @@ def _result(
     """
     design, sensor = found.search.design, given.part.sensor
     tiles = _unequal_tiles(given, locking, found, left)
-    alone = first.score_families(()) if found.estimates else ()
-    names, cosines, survival = first.design.identifiability()
+    p_without_effects = first.goodness_of_fit_p_value(first.score_families(())) if found.estimates else found.p_value
+    names, cosines, survival = first.design.identifiability
     tried = found.chosen[0].family_scores if found.chosen else found.tried
     return SelectionResult(
         tried=tuple(item for item in tried if not item.name.startswith(SPATIAL_NULL)),
         variance_tried=tuple(noise.tried),
         systematic=systematic,
         p_value=_smaller_p_value(found.p_value, tiles),
-        p_without_effects=_smaller_p_value(first.goodness_of_fit_p_value(alone) if alone else found.p_value, tiles),
+        p_without_effects=_smaller_p_value(p_without_effects, tiles),
         unexplained_noise=(
             NoiseRatio(1.0, False) if noise.terms else NoiseRatio.of(found.residuals, design.cells, left, given.random)
         ),
@@ -387,17 +376,14 @@ def _p_value_beside(points: SearchInput, found: SearchOutcome, kept: frozenset[s
     estimates = {f"{points.part.sensor}.{each.candidate.name}": each for each in found.estimates if not each.candidate.empirical}
     if not kept <= set(estimates):
         return None
-    again = repeat_search(points, [estimates[name] for name in sorted(kept)], found.search.single_effect_ratios)
-    return None if again is None else again[0].goodness_of_fit_p_value(again[0].score_families(()))
+    again = repeat_search(points, found, [estimates[name] for name in sorted(kept)])
+    return None if again is None else again.search.goodness_of_fit_p_value(again.search.score_families(()))
 
 
 def _detectable_sizes(
     found: SearchOutcome, noise_terms: Sequence[str], left: FloatArray, random: KeyedRandom
 ) -> tuple[DetectableSize, ...]:
-    """Sizes from which the effects that were not found would have shown beside those that were.
-
-    left: (n,) residuals after the systematic effects.
-    """
+    """Sizes from which effects that were not found would have shown. left: (n,) residuals after the systematic effects."""
     members = [each.candidate for each in found.further]
     systematic = found.search.detectable_sizes(members, found.tried, random.child("power"))
     noise = detectable_noise(found.residuals, found.search.design.cells, left, noise_terms, random)
@@ -422,14 +408,10 @@ def keep_implausible_in_class(
 
     Parameters
     ----------
-    named : effects that the repeated selection named.
+    named : effects that the repeated selection named; they are returned with the alternatives added.
     chosen : effects that the first selection chose; each lists the effects that it could not be told from.
     before : names of the systematic effects of the first selection, without the sensor's prefix.
     excluded : the implausible effects, as pairs (name, whether it is an empirical term).
-
-    Returns
-    -------
-    list : the effects of the repeated selection, with the alternatives added.
     """
     implausible = [each for each in chosen if (each.candidate.name, False) in excluded]
     found = []
@@ -437,9 +419,8 @@ def keep_implausible_in_class(
         sensor, name = item.name.split(".", 1)
         instead = item.kind == "physical" and item.effect.shows_in == ShowsIn.MEAN and name not in before
         alike = {f"{sensor}.{each.candidate.name}" for each in implausible if instead or name in each.indistinguishable}
-        found.append(
-            replace(item, indistinguishable=(*item.indistinguishable, *sorted(alike - {item.name, *item.indistinguishable})))
-        )
+        further = sorted(alike - {item.name, *item.indistinguishable})
+        found.append(replace(item, indistinguishable=(*item.indistinguishable, *further)))
     return found
 
 

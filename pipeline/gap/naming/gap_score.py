@@ -38,8 +38,7 @@ MEASURE = (
 )
 LOSS_MEASURE = "mean Brier score of pulses (lost or not) against their predicted probability of loss"
 _ENSEMBLE_SIZE = 8
-"""Simulations of an ensemble, most points that are simulated, points of a patch, and fewest points of a patch that is scored."""
-_MOST_POINTS = 30_000
+"""Simulations of an ensemble, points of a patch, and fewest points of a patch that is scored."""
 _POINTS_PER_PATCH = 30.0
 _FEWEST_POINTS = 8
 
@@ -82,11 +81,7 @@ class Gap:
 
     @property
     def closed(self) -> float | None:
-        """Share of the gap between model and measurement that the named effects close: (before - after) / (before - floor).
-
-        `before` and `after` are the scores of the model without and with these effects, and `floor` is the score that noise
-        alone leaves. 1 if only noise is left; None if the gap is within its uncertainty.
-        """
+        """Share of the gap that the named effects close: (before - after) / (before - floor). None if the gap is `uncertain`."""
         return None if self.uncertain else (self.before - self.after) / (self.before - self.floor)
 
     @property
@@ -100,20 +95,12 @@ class Gap:
 
     @property
     def left_open(self) -> bool:
-        """Whether the model fits worse than noise explains even with the named effects.
-
-        That is so if its score (`after`) exceeds the score that noise alone leaves (`floor`) by more than the uncertainty, as
-        for `above_floor`.
-        """
+        """Whether the model fits worse than noise explains even with the named effects, by the same test as `above_floor`."""
         return self.after - self.floor > _floor_sigmas() * self.floor_error
 
     @property
     def uncertain(self) -> bool:
-        """Whether the gap is too small to be measured, so that no closed share is stated.
-
-        That is so if two differences are both within their uncertainty: the score without the named effects (`before`) minus the
-        score that noise alone leaves (`floor`), and `before` minus the score with the effects (`after`).
-        """
+        """Whether the gap is too small to be measured: `before` - `floor` and `before` - `after` are within their uncertainty."""
         return not self.above_floor and self.before - self.after <= thresholds().verdict.gap_sigmas * self.error
 
     def to_dict(self) -> dict[str, Any]:
@@ -240,16 +227,14 @@ def measure_gap(
     floors = [
         np.sum([_crps(e, d[row]) for e, d in zip(ensembles[1], drawn, strict=True)], axis=0) for row in range(_ENSEMBLE_SIZE)
     ]
-    floor, count = np.mean(floors, axis=0) * unit, len(unit)
+    return _mean_scores(old, new, np.mean(floors, axis=0) * unit, int(usable.sum()), MEASURE, "m")
+
+
+def _mean_scores(old: FloatArray, new: FloatArray, floor: FloatArray, points: int, measure: str, unit: str) -> Gap:
+    """Return the means of the scores (p,) of p patches. The floor is limited to the score after; one draw may fall below."""
     floor = floor + min(float(new.mean() - floor.mean()), 0.0)
-    return Gap(
-        before=float(old.mean()),
-        after=float(new.mean()),
-        floor=float(floor.mean()),
-        error=float((old - new).std() / np.sqrt(count)),
-        floor_error=float((old - floor).std() / np.sqrt(count)),
-        points=int(usable.sum()),
-    )
+    error, floor_error = (float((old - each).std() / np.sqrt(len(old))) for each in (new, floor))
+    return Gap(float(old.mean()), float(new.mean()), float(floor.mean()), error, floor_error, points, measure, unit)
 
 
 def measure_losses(missing: ExpectedPulses, chance: FloatArray, held_out: BoolArray) -> Gap | None:
@@ -276,18 +261,7 @@ def measure_losses(missing: ExpectedPulses, chance: FloatArray, held_out: BoolAr
     count = np.bincount(patch)
     share = float(missing.lost[~held_out].mean())
     old, new, floor = (np.bincount(patch, each) / count for each in ((lost - share) ** 2, (lost - p) ** 2, p * (1 - p)))
-    floor = floor + min(float(new.mean() - floor.mean()), 0.0)
-    errors = [float((old - each).std() / np.sqrt(len(count))) for each in (new, floor)]
-    return Gap(
-        before=float(old.mean()),
-        after=float(new.mean()),
-        floor=float(floor.mean()),
-        error=errors[0],
-        floor_error=errors[1],
-        points=len(lost),
-        measure=LOSS_MEASURE,
-        unit="1",
-    )
+    return _mean_scores(old, new, floor, len(lost), LOSS_MEASURE, "1")
 
 
 def _draw_ensemble(measurement: Measurement, version: RegisteredModel, residuals: Residuals, random: KeyedRandom) -> FloatArray:
@@ -303,16 +277,9 @@ def _draw_ensemble(measurement: Measurement, version: RegisteredModel, residuals
 
 
 def _patch_statistics(draws: FloatArray, patch: NDArray[np.int64], error: FloatArray | None = None) -> FloatArray:
-    """Return the mean and the standard deviation of each of p patches, (2, d, p), in d simulated draws.
+    """Return the mean and the standard deviation of each of p patches, (2, d, p), in d simulated draws of residuals (d, n).
 
-    Parameters
-    ----------
-    draws : (d, n) array
-        Simulated residuals.
-    patch : (n,) array
-        Patch of each point.
-    error : (d, p) array, optional
-        Error of the reference of each patch, in each draw.
+    patch: (n,) patch of each point. error: (d, p) error of the reference of each patch, in each draw.
     """
     count = np.bincount(patch)
     mean = np.stack([np.bincount(patch, row) for row in draws]) / count
@@ -326,11 +293,3 @@ def _crps(draws: FloatArray, value: FloatArray) -> FloatArray:
     weight = (2 * np.arange(count) - count + 1)[:, None]
     spread = 2 * np.sum(weight * ordered, axis=0) / (count * (count - 1))
     return np.asarray(np.abs(draws - value).mean(axis=0) - spread / 2)
-
-
-def subsampling(count: int) -> slice:
-    """Return a slice that keeps evenly spaced ones of n points, so that scoring stays quick.
-
-    count: n. All are kept if they are fewer than 60,000, else 30,000 to 45,000.
-    """
-    return slice(None, None, max(count // _MOST_POINTS, 1))

@@ -163,20 +163,6 @@ def only_within_bounds(model: TlsModel | StereoModel, named: list[NamedEffect]) 
     ]
 
 
-def is_plausible(model: TlsModel | StereoModel, entry: dict[str, Any]) -> bool:
-    """Tell whether a fitted sensor error (effect) is plausible, so that absurd explanations are not reported.
-
-    It is if a config accepts its values and its size is at most `largest_relative_size` (by default 100) times its
-    typical size in the catalogue.
-
-    model: the sensor model that would contain the effect.
-    entry: the effect as in the model's config: name and parameter values.
-    """
-    if not within_bounds(model, entry):
-        return False
-    return relative_size(entry) <= largest_relative_size()
-
-
 def relative_size(entry: dict[str, Any]) -> float:
     """Return how many times its typical size in the catalogue a sensor error (effect) has, to judge its plausibility.
 
@@ -197,8 +183,7 @@ def effect_from_range_step(comb: RangeStep, part: Residuals) -> NamedEffect:
     part: residuals of the rounded ranges; only their number is used.
     """
     entry = {"name": RangeQuantization.tag(), "step_m": comb.step_m}
-    name, gain = f"tls.{RangeQuantization.tag()}", float(len(part)) * comb.strength
-    return NamedEffect(name, "physical", entry, {"step_m": comb.std_m}, (), None, gain)
+    return _named("tls", entry, {"step_m": comb.std_m}, float(len(part)) * comb.strength)
 
 
 def effect_from_locking(found: Locking) -> NamedEffect:
@@ -214,7 +199,7 @@ def effect_from_locking(found: Locking) -> NamedEffect:
         "phase_rad": found.phase_rad,
         "tilt_rad": found.tilt_rad,
     }
-    return NamedEffect(f"stereo.{PixelLocking.tag()}", "physical", entry, {"amplitude_px": found.std_px}, (), None, found.gain)
+    return _named("stereo", entry, {"amplitude_px": found.std_px}, found.gain)
 
 
 def effect_from_seams(found: TileSeams) -> NamedEffect:
@@ -225,7 +210,7 @@ def effect_from_seams(found: TileSeams) -> NamedEffect:
     """
     entry = {"name": TileShift.tag(), "amplitude_px": found.amplitude_px, "tile_px": found.tile_px}
     std = {"amplitude_px": found.amplitude_std_px, "tile_px": found.tile_std_px}
-    return NamedEffect(f"stereo.{TileShift.tag()}", "physical", entry, std, (), found.p_value, found.gain)
+    return _named("stereo", entry, std, found.gain, p_value=found.p_value)
 
 
 def effect_from_variance(found: VarianceTerm, sensor: str) -> NamedEffect:
@@ -234,11 +219,9 @@ def effect_from_variance(found: VarianceTerm, sensor: str) -> NamedEffect:
     found: the noise term, which explains variance of the residuals that the sensor model does not predict.
     sensor: "tls" or "stereo", the prefix of the name.
     """
-    alike = tuple(f"{sensor}.{name}" for name in found.indistinguishable)
     empirical = found.empirical or effect_of(found.effect).empirical
-    entry = {"name": found.effect, **found.parameters}
-    name, kind = f"{sensor}.{found.effect}", "empirical" if empirical else "physical"
-    return NamedEffect(name, kind, entry, found.std, () if empirical else alike, found.p_value, found.gain)
+    entry, alike = {"name": found.effect, **found.parameters}, () if empirical else found.indistinguishable
+    return _named(sensor, entry, found.std, found.gain, empirical=empirical, alike=alike, p_value=found.p_value)
 
 
 def effect_from_edges(found: EdgeEffect) -> NamedEffect:
@@ -247,7 +230,7 @@ def effect_from_edges(found: EdgeEffect) -> NamedEffect:
     found: the effect with its estimated parameters and their standard deviations.
     """
     entry = {"name": found.name, **found.effect.model_dump(mode="json", exclude_unset=True)}
-    return NamedEffect(f"{found.effect.sensor}.{found.name}", "physical", entry, found.std, (), None, found.gain)
+    return _named(found.effect.sensor, entry, found.std, found.gain)
 
 
 def effect_from_tails(part: Residuals, sigma: float, gain: float) -> NamedEffect:
@@ -262,7 +245,7 @@ def effect_from_tails(part: Residuals, sigma: float, gain: float) -> NamedEffect
     gain : log-likelihood ratio of the noise models with and without heavy tails.
     """
     noise, key = part.white_noise
-    return NamedEffect(f"{part.sensor}.{noise.tag()}", "empirical", {"name": noise.tag(), key: sigma}, {}, (), None, gain)
+    return _named(part.sensor, {"name": noise.tag(), key: sigma}, {}, gain, empirical=True)
 
 
 def effect_from_losses(found: LossExplanation, intensity: FloatArray | None) -> NamedEffect:
@@ -275,13 +258,27 @@ def effect_from_losses(found: LossExplanation, intensity: FloatArray | None) -> 
         powers were recorded.
     """
     parameters, std = dict(found.parameters), dict(found.std)
-    kind = "empirical" if found.covariate else "physical"
     if found.name == DetectionLimit.tag() and intensity is not None:
         # the limit lies about as far below the weakest power as the weakest powers lie apart
         low = np.sort(intensity)[: _WEAKEST_POWERS + 1]
         gap = float(low[-1] - low[0]) / (len(low) - 1)
         parameters["minimum_power"], std["minimum_power"] = float(low[0]) - gap, gap
-    return NamedEffect(f"tls.{found.name}", kind, {"name": found.name, **parameters}, std, (), None, found.gain)
+    return _named("tls", {"name": found.name, **parameters}, std, found.gain, empirical=bool(found.covariate))
+
+
+def _named(
+    sensor: str,
+    entry: dict[str, Any],
+    std: dict[str, float],
+    gain: float,
+    *,
+    empirical: bool = False,
+    alike: Iterable[str] = (),
+    p_value: float | None = None,
+) -> NamedEffect:
+    """Return a named effect. alike: names of those that it cannot be told from, without the sensor's prefix."""
+    kind, others = "empirical" if empirical else "physical", tuple(f"{sensor}.{name}" for name in alike)
+    return NamedEffect(f"{sensor}.{entry['name']}", kind, entry, std, others, p_value, gain)
 
 
 @dataclass(frozen=True)
@@ -310,21 +307,14 @@ def effect_from_estimate(found: Estimate, part: Residuals) -> NamedEffect:
     found: the error as a regression term with fitted coefficients.
     part: residuals of the points to which it was fitted.
     """
-    if found.candidate.empirical:
-        return _empirical_effect(found.candidate, found.values, found.chosen, part)
-    return _physical_effect(found.candidate, found.values, found.covariance, found.chosen, part)
-
-
-def _physical_effect(
-    candidate: Candidate, values: FloatArray, covariance: FloatArray, item: SelectedEffect, part: Residuals
-) -> NamedEffect:
-    """Name an effect of the catalogue by its parameters."""
-    entry = {"name": candidate.name, **candidate.fixed, **candidate.parameters(values)}
-    std = _standard_deviations(candidate, values, covariance)
-    alike = tuple(f"{part.sensor}.{name}" for name in item.indistinguishable)
-    return NamedEffect(
-        f"{part.sensor}.{candidate.name}", "physical", _plain_numbers(entry), std, alike, item.p_value, item.log_likelihood_ratio
-    )
+    candidate, item = found.candidate, found.chosen
+    ratio, p_value = item.log_likelihood_ratio, item.p_value
+    if candidate.empirical:
+        entry = _empirical_entry(candidate, found.values, part)
+        return _named(part.sensor, entry, {}, ratio, empirical=True, p_value=p_value)
+    entry = {"name": candidate.name, **candidate.fixed, **candidate.parameters(found.values)}
+    std = _standard_deviations(candidate, found.values, found.covariance)
+    return _named(part.sensor, entry, std, ratio, alike=item.indistinguishable, p_value=p_value)
 
 
 def _standard_deviations(candidate: Candidate, values: FloatArray, covariance: FloatArray) -> dict[str, float]:
@@ -341,32 +331,23 @@ def _standard_deviations(candidate: Candidate, values: FloatArray, covariance: F
     return std
 
 
-def _empirical_effect(candidate: Candidate, values: FloatArray, item: SelectedEffect, part: Residuals) -> NamedEffect:
-    """Describe a non-parametric term by its values at nodes: over one cycle if periodic, else over the range of its covariate."""
+def _empirical_entry(candidate: Candidate, values: FloatArray, part: Residuals) -> dict[str, Any]:
+    """Describe a non-parametric term by its values at nodes: over one cycle if periodic, else over the range of its covariate.
+
+    A curve of an angle's error is recovered from the half of the ranges that depend most on the angle.
+    """
     error = candidate.columns @ values[: candidate.columns.shape[1]]
     if candidate.angle and isinstance(part, TlsResiduals):
-        return _angle_term(candidate, error, item, part)
-    term, key = part.empirical_term
-    found = _surface_nodes(error, part) if candidate.form == POLYNOMIAL else _curve_nodes(candidate, error, part)
+        lever = -{"azimuth": part.geometry.by_azimuth, "zenith": part.geometry.by_zenith}[candidate.angle]
+        steep = np.abs(lever) > np.median(np.abs(lever))
+        error = np.divide(error, lever, out=np.zeros_like(error), where=steep)
+        name, key = AngleEmpirical.tag(), "values_rad"
+        found = {"angle": candidate.angle, **_curve_nodes(candidate, error, part, steep)}
+    else:
+        name, key = part.empirical_term[0].tag(), part.empirical_term[1]
+        found = _surface_nodes(error, part) if candidate.form == POLYNOMIAL else _curve_nodes(candidate, error, part)
     rows = _rounded_rows(found.pop("values"))
-    entry = {"name": term.tag(), **found, key: rows}
-    return NamedEffect(f"{part.sensor}.{term.tag()}", "empirical", entry, {}, (), item.p_value, item.log_likelihood_ratio)
-
-
-def _angle_term(candidate: Candidate, error: FloatArray, item: SelectedEffect, part: TlsResiduals) -> NamedEffect:
-    """Describe an error of an angle by a curve, which is recovered from the ranges.
-
-    Only the half of the points is used at which the range depends most on the angle.
-    """
-    levers = {"azimuth": part.geometry.by_azimuth, "zenith": part.geometry.by_zenith}
-    lever = -levers[candidate.angle]
-    steep = np.abs(lever) > np.median(np.abs(lever))
-    found = _curve_nodes(candidate, np.divide(error, lever, out=np.zeros_like(error), where=steep), part, steep)
-    rows = _rounded_rows(found.pop("values"))
-    entry = {"name": AngleEmpirical.tag(), "angle": candidate.angle, **found, "values_rad": rows}
-    return NamedEffect(
-        f"{part.sensor}.{AngleEmpirical.tag()}", "empirical", entry, {}, (), item.p_value, item.log_likelihood_ratio
-    )
+    return {"name": name, **found, key: rows}
 
 
 def merge_angle_curves(
@@ -451,27 +432,23 @@ def _covariate_offset(covariate: str, part: Residuals) -> float:
     return float(np.median(np.log(np.maximum(part.geometry.power, 1e-12)) - part.covariates[covariate]))
 
 
-def _plain_numbers(entry: dict[str, Any]) -> dict[str, Any]:
-    """Convert NumPy numbers of an entry to Python floats."""
-    return {key: float(value) if isinstance(value, np.floating) else value for key, value in entry.items()}
-
-
 def out_of_bounds(measurement: Measurement, estimates: list[Estimate], part: Residuals) -> frozenset[tuple[str, bool]]:
     """Find fitted sensor errors (effects) of implausible size, to exclude them from the next selection.
 
-    They are those whose values a config does not accept, and those that are far larger than typical.
+    They are those whose values a config does not accept, and those larger than `largest_relative_size` (by default 100) times
+    their typical size in the catalogue. They are returned as pairs (name, whether it is an empirical term).
 
     Parameters
     ----------
     measurement : measurement to whose sensor model the effects would be added.
     estimates : effects with fitted coefficients.
     part : residuals of the points to which the rows of their design columns belong.
-
-    Returns
-    -------
-    frozenset : effects to exclude, as pairs (name, whether it is an empirical term).
     """
-    wrong = [each for each in estimates if not is_plausible(measurement.model, effect_from_estimate(each, part).entry)]
+
+    def is_plausible(entry: dict[str, Any]) -> bool:
+        return within_bounds(measurement.model, entry) and relative_size(entry) <= largest_relative_size()
+
+    wrong = [each for each in estimates if not is_plausible(effect_from_estimate(each, part).entry)]
     return frozenset((each.candidate.name, each.candidate.empirical) for each in wrong)
 
 
@@ -482,17 +459,14 @@ def absorbed_by_registration(
 
     A shift and rotation of the sensor imitates such an effect almost completely, so the pose fit absorbs it. Two thresholds
     tell it: a share of less than `mean.absorbed_share` of its signature (the pattern of residuals that it makes) is left beside
-    the pose, and its size is more than one standard deviation of its prior, `mean.prior_size`.
+    the pose, and its size is more than one standard deviation of its prior, `mean.prior_size`. Such effects are returned as pairs
+    (name, False); empirical terms are not considered.
 
     Parameters
     ----------
     estimates : effects with fitted coefficients.
     part : residuals of the points to which the rows of their design columns belong.
     survival : by effect name, the share of the effect's signature that is left after the pose is fitted, from 0 to 1.
-
-    Returns
-    -------
-    frozenset : these effects, as pairs (name, False); empirical terms are not considered.
     """
     by = thresholds().mean
     doubtful = [each for each in estimates if not each.candidate.empirical and survival[each.candidate.name] < by.absorbed_share]

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from pipeline.formats.measurements.measurement import Measurement
-from pipeline.gap.mean.candidates import Candidate, prior_precision
+from pipeline.gap.mean.candidates import Candidate
 from pipeline.gap.mean.search import MeanSearch
 from pipeline.gap.mean.selection import SelectedEffect
 from pipeline.gap.naming.candidate_families import catalogue_families
@@ -20,7 +20,6 @@ from pipeline.gap.naming.search_beside_effects import (
     recomputed,
     repeat_search,
     search_at_joint_fit,
-    still_present,
     too_few_left,
 )
 from pipeline.gap.naming.search_outcome import SearchInput, SearchOutcome
@@ -83,8 +82,7 @@ class _SingleFit:
     def improved(self, given: SearchInput, first: MeanSearch) -> _SingleFit | None:
         """Return the fit after one Gauss-Newton step from the present values; None for the reasons of `of`."""
         candidate = recomputed(self.estimate.candidate, catalogue_families(self.measurement, self.residuals))
-        width = candidate.columns.shape[1]
-        step = gauss_newton_step(self.residuals, candidate.columns, prior_precision(candidate, width), np.zeros(width))
+        step = gauss_newton_step(self.residuals, [candidate])
         return _SingleFit.of(given, first, replace(self.estimate, values=self.estimate.values + step))
 
 
@@ -350,7 +348,7 @@ def _registered_residuals(found: Residuals, part: Residuals) -> tuple[FloatArray
     """
     registered, _, noise_ratio = fit_pose_robustly(found)
     largest = thresholds().points.outlier_sigmas * noise_ratio * found.sigma
-    value, used = np.zeros(len(part)), still_present(found, part)
+    value, used = np.zeros(len(part)), np.isin(part.index, found.index)
     value[used] = np.where(found.usable, np.clip(registered, -largest, largest), 0.0)
     used[used] = found.usable
     return value, used
@@ -390,8 +388,4 @@ def _search_beside(given: SearchInput, chosen: SearchOutcome) -> SearchOutcome |
     physical = [each for each in chosen.estimates if not each.candidate.empirical]
     if not physical or out_of_bounds(given.measurement, chosen.estimates, chosen.residuals):
         return None
-    again = repeat_search(given, physical, chosen.search.single_effect_ratios)
-    if again is None:
-        return None
-    search, at, estimates, further, tried = again
-    return replace(chosen, estimates=estimates, search=search, residuals=at, further=further, tried=tried)
+    return repeat_search(given, chosen, physical)

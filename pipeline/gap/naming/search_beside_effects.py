@@ -2,23 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from pipeline.formats.measurements.measurement import Measurement
-from pipeline.gap.mean.candidates import Candidate, ExplanationKey, SineGrid, prior_precision
+from pipeline.gap.mean.candidates import Candidate, SineGrid, prior_precision
 from pipeline.gap.mean.nonparametric_terms import HARMONIC_ORDERS, HARMONICS, harmonics
 from pipeline.gap.mean.search import MeanSearch
-from pipeline.gap.mean.selection import FamilyScore, SelectedEffect
+from pipeline.gap.mean.selection import SelectedEffect
 from pipeline.gap.naming.candidate_families import PERIODIC, candidate_families, catalogue_families
-from pipeline.gap.naming.effect_screening import estimate_of_size, gauss_newton_step
+from pipeline.gap.naming.effect_screening import all_columns, estimate_of_size, gauss_newton_step
 from pipeline.gap.naming.named_effects import Estimate, aligned_with, effect_from_estimate, out_of_bounds
 from pipeline.gap.naming.search_outcome import SearchInput, SearchOutcome
 from pipeline.gap.naming.search_residuals import with_added_variance, with_fitted_variance
 from pipeline.gap.residuals.alignment import AlignedMeasurement, at_points_of, fit_pose_robustly
-from pipeline.gap.residuals.residuals import BoolArray, Residuals
+from pipeline.gap.residuals.residuals import Residuals
 from pipeline.gap.thresholds import thresholds
 from scene.geometry.mesh import FloatArray
 
@@ -26,52 +25,49 @@ _MOST_FITS, _CONVERGED_DECREASE = 10, 0.005
 """Most iterations of a joint fit, and the relative decrease of the mean square at which it ends where nothing else is said."""
 
 
-def repeat_search(
-    given: SearchInput, known_effects: list[Estimate], alone: Mapping[ExplanationKey, float]
-) -> tuple[MeanSearch, Residuals, list[Estimate], list[SelectedEffect], tuple[FamilyScore, ...]] | None:
+def repeat_search(given: SearchInput, before: SearchOutcome, known_effects: list[Estimate]) -> SearchOutcome | None:
     """Repeat the search with some effects in the model, whose coefficients stay free like the pose.
 
     Parameters
     ----------
     given : input of the searches.
+    before : explanation of the search before.
     known_effects : effects to put into the model.
-    alone : log-likelihood ratio of each explanation alone.
 
     Returns
     -------
-    tuple or None : the search, its residuals, the estimates of all effects, the new explanations, and what was tried last; None
-        if too few rays meet the reference with the effects.
+    SearchOutcome or None : the effects that are in the model and those that were found beside them; None if too few rays meet
+        the reference with the effects.
     """
-    part = given.part
     measurement, found, _ = aligned_with_estimates(given, known_effects)
-    at = with_added_variance(at_points_of(found, part), given.added)
+    at = with_added_variance(at_points_of(found, given.part), given.added)
     if too_few_left(given, at):
         return None
     catalogue = catalogue_families(measurement, at)
-    renewed = candidate_families(measurement, at, catalogue)
     allowed = {(family.name, family.empirical) for family in given.families}
-    names = {each.candidate.name for each in known_effects}
-    others = [each for each in renewed if (each.name, each.empirical) in allowed and (each.empirical or each.name not in names)]
+    allowed -= {(each.candidate.name, False) for each in known_effects}
+    families = [each for each in candidate_families(measurement, at, catalogue) if (each.name, each.empirical) in allowed]
     known = [replace(each, candidate=recomputed(each.candidate, catalogue)) for each in known_effects]
-    columns = [_free_columns(each) for each in known]
     periodic = [(PERIODIC[name], each.candidate) for each in known if (name := each.candidate.name) in PERIODIC]
-    others += [harmonics(covariate, sine, last) for covariate, sine in periodic for last in HARMONIC_ORDERS]
-    weighted = with_variance_refitted(given, at)
+    families += [harmonics(covariate, sine, last) for covariate, sine in periodic for last in HARMONIC_ORDERS]
+    pose = at.pose_jacobian.shape[1]
+    columns = [each.candidate.columns_given(None if each.candidate.wave is None else each.values[:2]) for each in known]
     precision = [prior_precision(each.candidate, matrix.shape[1]) for each, matrix in zip(known, columns, strict=True)]
     search = MeanSearch(
-        replace(weighted, pose_jacobian=np.concatenate([at.pose_jacobian, *columns], axis=1)),
-        others,
+        replace(with_variance_refitted(given, at), pose_jacobian=np.concatenate([at.pose_jacobian, *columns], axis=1)),
+        families,
         given.random.child("again"),
-        np.concatenate([np.zeros(at.pose_jacobian.shape[1]), *precision]),
-        alone,
+        np.concatenate([np.zeros(pose), *precision]),
+        before.search.single_effect_ratios,
     )
     chosen, tried = search.select()
     fit = search.design.fit_refined([item.candidate for item in chosen])[1]
-    kept, start = [], at.pose_jacobian.shape[1]
+    kept, start = [], pose
     for each, matrix in zip(known, columns, strict=True):
         place = slice(start, start := start + matrix.shape[1])
         kept.append(replace(each, values=each.values + fit.coefficients[place], covariance=fit.covariance[place, place]))
-    return search, at, _merge_sines_with_overtones([*kept, *estimates_of(search, chosen)]), chosen, tried
+    estimates = _merge_sines_with_overtones([*kept, *estimates_of(search, chosen)])
+    return SearchOutcome(before.chosen, estimates, search, at, chosen, tried)
 
 
 def search_at_joint_fit(given: SearchInput) -> SearchOutcome | None:
@@ -81,14 +77,8 @@ def search_at_joint_fit(given: SearchInput) -> SearchOutcome | None:
     fit moves each ray to about where the real one was, so that the derivatives taken there are right. What the fitted effects
     explain is then added back to the residuals, and effects are selected anew.
 
-    Parameters
-    ----------
-    given : points, residuals and candidate effects.
-
-    Returns
-    -------
-    SearchOutcome or None : the selected effects; None if the catalogue has none for these residuals, if a fitted effect is out of
-        bounds, or if too few points remain.
+    given: points, residuals and candidate effects. None is returned if the catalogue has no effects for these residuals, if a
+    fitted effect is out of bounds, or if too few points remain.
     """
     plain = [each for each in given.families if isinstance(each, Candidate) and not each.empirical]
     fitted = fit_jointly(given, plain) if plain else None
@@ -135,7 +125,7 @@ def fit_jointly(
         found = step
         if number and after > (1 - least_decrease) * before:
             break
-    return found.measurement, found.residuals, np.asarray(_all_columns(found.candidates) @ found.values)
+    return found.measurement, found.residuals, np.asarray(all_columns(found.candidates) @ found.values)
 
 
 @dataclass(frozen=True)
@@ -158,17 +148,15 @@ class _JointFit:
 
     def mean_square_beside(self, other: _JointFit) -> float:
         """Mean squared residual, in units of the predicted variance, of the points that meet the reference in both fits."""
-        common = still_present(other.residuals, self.residuals)
+        common = np.isin(self.residuals.index, other.residuals.index)
         return float(np.mean((self.residuals.value / self.residuals.sigma)[common] ** 2))
 
     def stepped(self, given: SearchInput) -> _JointFit | None:
         """Change the sizes by a Gauss-Newton step; None if an effect is then out of bounds, or too few points remain."""
-        at, widths = self.residuals, [each.columns.shape[1] for each in self.candidates]
-        precision = np.concatenate([prior_precision(each, width) for each, width in zip(self.candidates, widths, strict=True)])
-        values = self.values + gauss_newton_step(at, _all_columns(self.candidates), precision, self.values)
-        parts = np.split(values, np.cumsum(widths)[:-1])
+        values = self.values + gauss_newton_step(self.residuals, self.candidates, self.values)
+        parts = np.split(values, np.cumsum([each.columns.shape[1] for each in self.candidates])[:-1])
         estimates = [estimate_of_size(each, part) for each, part in zip(self.candidates, parts, strict=True)]
-        if out_of_bounds(given.measurement, estimates, at):
+        if out_of_bounds(given.measurement, estimates, self.residuals):
             return None
         measurement, found, _ = aligned_with_estimates(given, estimates)
         at = with_added_variance(at_points_of(found, given.part), given.added)
@@ -215,11 +203,6 @@ def with_variance_refitted(given: SearchInput, at: Residuals) -> Residuals:
     return with_fitted_variance(at, given.variance_at(at), fit_pose_robustly(at)[2])
 
 
-def still_present(at: Residuals, part: Residuals) -> BoolArray:
-    """Return for each of the n points of `part` whether the residuals `at` contain it, as a boolean array of shape (n,)."""
-    return np.isin(part.index, at.index)
-
-
 def recomputed(candidate: Candidate, families: list[Candidate | SineGrid]) -> Candidate:
     """Return an effect as a regression term for other rays or another sensor model.
 
@@ -247,17 +230,6 @@ def too_few_left(given: SearchInput, at: Residuals) -> bool:
     given : the points; at : residuals of those that meet the reference.
     """
     return len(at) < thresholds().points.least_share_on_reference * len(given.part)
-
-
-def _all_columns(candidates: list[Candidate]) -> FloatArray:
-    """Columns of all candidates side by side."""
-    return np.asarray(np.concatenate([each.columns for each in candidates], axis=1))
-
-
-def _free_columns(found: Estimate) -> FloatArray:
-    """(n, k) columns of an effect's coefficients; a sine also has that of its frequency."""
-    wave = found.candidate.wave
-    return found.candidate.columns if wave is None else wave.with_frequency_derivative(found.candidate.period, found.values[:2])
 
 
 def _merge_sines_with_overtones(estimates: list[Estimate]) -> list[Estimate]:

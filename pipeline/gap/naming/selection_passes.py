@@ -88,8 +88,7 @@ class PassInput:
     ) -> PassInput:
         """Build the input of one run of the search for sensor errors, with certain edge effects in the sensor model.
 
-        Edge effects are errors at depth steps: edge fattening, smoothing, filled occlusions and the beam footprint. Regions
-        where the rock changed are found and set aside.
+        Regions where the rock changed are found and set aside.
 
         Parameters
         ----------
@@ -116,12 +115,8 @@ class PassInput:
             changes = drop_duplicates(changes)
         registered_residuals, _, noise_ratio = fit_pose_robustly(replace(judged, usable=judged.usable & ~changed))
         held_out = held_out_points[residuals.index]
-        usable = (
-            judged.usable
-            & ~changed
-            & (np.abs(registered_residuals) < thresholds().points.outlier_sigmas * noise_ratio * judged.sigma)
-        )
-        training_rows = subsample_rows(np.flatnonzero(usable & ~held_out))
+        inlier = np.abs(registered_residuals) < thresholds().points.outlier_sigmas * noise_ratio * judged.sigma
+        usable = judged.usable & ~changed & inlier
         return cls(
             edge_effects,
             modelled,
@@ -132,7 +127,7 @@ class PassInput:
             registered_residuals,
             noise_ratio,
             held_out,
-            training_rows,
+            subsample_rows(np.flatnonzero(usable & ~held_out)),
             1 - float(usable.sum()) / max(int(judged.usable.sum()), 1),
             large_effect,
         )
@@ -154,9 +149,8 @@ class PassInput:
     def training_part(self) -> tuple[Measurement, Residuals]:
         """The measurement and the residuals of the training points alone, from which sensor errors are selected.
 
-        Training points are a subsample of the points on smooth, unchanged surface that are no outliers and not kept for
-        validation. The shift of these points by edge effects (errors at depth steps) is not computed again while the pose is
-        fitted: a move by millimetres hardly changes it.
+        The shift of these points by edge effects (errors at depth steps) is not computed again while the pose is fitted: a move
+        by millimetres hardly changes it.
         """
         measurement, residuals = self.measurement, self.residuals
         if isinstance(measurement, StereoMeasurement) and isinstance(residuals, StereoResiduals):
@@ -195,15 +189,6 @@ class SelectionPass:
         noise = None if given.large_effect is None else given.registered_residuals[given.training_rows]
         selected = select_effects(SelectionInput(*given.training_part, given.noise_ratio, random, excluded, noise))
         return cls(given, *selected)
-
-    @property
-    def edge_effect_names(self) -> set[str]:
-        """Names of the edge effects in the sensor model of this run of the search, by which runs are told apart.
-
-        Edge effects are errors at depth steps, such as edge fattening. They were found before the run, which selects other
-        errors.
-        """
-        return _names(self.pass_input.edge_effects)
 
 
 def _names(effects: list[EdgeEffect]) -> set[str]:
@@ -282,10 +267,6 @@ class PassInputs:
         The pose is estimated with the edge effects of the first search in the model too, because edge fattening shifts it.
 
         found: a run of the search, with the sensor errors to put into the model first.
-
-        Returns
-        -------
-        list : the edge effects that the residuals then show.
         """
         return self._edge_effects_beside(found.named, [effect_from_edges(each) for each in found.pass_input.edge_effects])
 
@@ -296,10 +277,7 @@ class PassInputs:
         return _find_edge_effects(seen, compute_residuals(seen), self.held_out_points)
 
     def with_these(self, edge_effects: list[EdgeEffect]) -> PassInput:
-        """Return the input of a search for sensor errors with the given effects at depth steps in the sensor model.
-
-        The sensor's pose is estimated again with these in the model. edge_effects: the effects, such as edge fattening.
-        """
+        """Return the input of a search for sensor errors, with effects at depth steps in the model and the pose fitted again."""
         if not edge_effects and self.large_effect is None:
             return self._without_effects
         return PassInput.of(self.measurement, self.plain, self.held_out_points, edge_effects, self.large_effect)
@@ -320,10 +298,10 @@ def select_beside_edge_effects(inputs: PassInputs, random: KeyedRandom, excluded
     found = SelectionPass.of(inputs.with_these(inputs.edge_effects), random, excluded)
     if not found.named:
         return found
-    # a small error of the rays' directions looks like smoothing
-    imitated = {Smoothing.tag()} - found.edge_effect_names
+    before = _names(found.pass_input.edge_effects)
+    imitated = {Smoothing.tag()} - before  # a small error of the rays' directions looks like smoothing
     edge_effects = [each for each in inputs.edge_effects_given(found) if each.name not in imitated]
-    if _names(edge_effects) == found.edge_effect_names:
+    if _names(edge_effects) == before:
         return found
     return SelectionPass.of(inputs.with_these(edge_effects), random, excluded)
 
@@ -381,28 +359,23 @@ def _with_effects(
         return measurement, residuals, residuals.on_smooth_surface
     modelled = measurement.changed(model=with_effects(measurement.model, entries))
     modelled, found, _ = align(modelled, registration_rows)
-    place = np.full(len(measurement.cloud.points), -1)
-    place[found.index] = np.arange(len(found))
-    rows = place[residuals.index]
-    known = rows >= 0
-    matched = residuals.with_rows_from(known, found.part(rows[known]))
+    rows = found.values_at(np.arange(len(found), dtype=np.float64), residuals.index)
+    known = np.isfinite(rows)
+    own = found.part(rows[known].astype(np.int64))
     smooth = np.zeros(len(residuals), dtype=bool)
-    smooth[known] = found.on_smooth_surface[rows[known]]
+    smooth[known] = own.on_smooth_surface
+    matched = residuals.with_rows_from(known, own)
     return modelled, replace(matched, usable=residuals.usable & ~touched & known), smooth
 
 
 def subsample(measurement: Measurement, residuals: Residuals, rows: NDArray[np.int64]) -> tuple[Measurement, Residuals]:
-    """Restrict a measurement and its residuals to the same points, so that a fit uses these alone.
+    """Restrict a measurement and its residuals to the same k points, so that a fit uses these alone.
 
     Parameters
     ----------
     measurement : the measured points with their sensor model.
     residuals : residuals of n of its points, measured minus predicted.
     rows : (k,) rows of the residuals to keep.
-
-    Returns
-    -------
-    tuple : measurement and residuals of k points.
     """
     part = residuals.part(rows)
     return measurement.part(part.index), replace(part, index=np.arange(len(rows)), expected_pulses=None)

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.formats.measurements.measurement import Measurement
-from pipeline.gap.naming.gap_score import LOSS_MEASURE, Gap, RegisteredModel, measure_gap, measure_losses, subsampling
+from pipeline.gap.naming.gap_score import LOSS_MEASURE, Gap, RegisteredModel, measure_gap, measure_losses
 from pipeline.gap.naming.named_effects import NamedEffect, aligned_with, with_effects
 from pipeline.gap.noise_and_edges.missing_returns import LossExplanation
 from pipeline.gap.residuals.alignment import fit_pose
@@ -19,7 +19,8 @@ from scene.geometry.mesh import FloatArray
 from sensors.effects.base import ShowsIn
 from sensors.models.sensor_model import StereoModel, TlsModel
 
-_FEWEST_POINTS = 100
+_FEWEST_POINTS, _MOST_POINTS = 100, 30_000
+"""Fewest points that are scored; and the number from twice which on points are left out at even distances, to save time."""
 
 
 @dataclass(frozen=True)
@@ -60,15 +61,9 @@ class ValidationResult:
 
     @property
     def is_clearly_worse(self) -> bool:
-        """Whether the sensor model predicts validation points worse with the named sensor errors than without, beyond chance.
-
-        The difference of the scores must exceed its uncertainty, 2 standard errors by default.
-        """
-        return (
-            self.is_worse
-            and self.gap is not None
-            and self.gap.after - self.gap.before > thresholds().verdict.gap_sigmas * self.gap.error
-        )
+        """Whether the model predicts validation points worse with the named effects by more than 2 standard errors (default)."""
+        sigmas, gap = thresholds().verdict.gap_sigmas, self.gap
+        return gap is not None and self.is_worse and gap.after - gap.before > sigmas * gap.error
 
 
 @dataclass(frozen=True)
@@ -103,12 +98,7 @@ class Validation:
 
     @property
     def pose(self) -> FloatArray:
-        """Pose that registers the measurement to the model without named effects, relative to the pose in the measurement.
-
-        (6 k,) shift (m) and small rotation (rad) of each of k set-ups, wall frame. For a surface without cameras: (q,)
-        amounts of those combinations of shift, rotation and scale that its points determine, as the attribute `datum` of its
-        residuals defines them.
-        """
+        """Pose that registers the measurement to the model without named effects, in the form of `ValidationResult.pose`."""
         return fit_pose(self.residuals, self.registration_rows)
 
     def validate(self, named: list[NamedEffect]) -> tuple[ValidationResult, list[str]]:
@@ -119,9 +109,7 @@ class Validation:
         the validation score is worse by more than its uncertainty: effects found in the distribution of the values (such as
         rounding), and empirical terms that are no noise. Lower noise values are proposed only if they predict better.
 
-        Parameters
-        ----------
-        named : effects (sensor errors) that passed the selection.
+        named: effects (sensor errors) that passed the selection.
 
         Returns
         -------
@@ -186,7 +174,7 @@ class Validation:
         places = np.flatnonzero(rows)
         if len(places) < _FEWEST_POINTS:
             return None
-        part = self.residuals.part(places[subsampling(len(places))])
+        part = self.residuals.part(places[:: max(len(places) // _MOST_POINTS, 1)])
         random = self.random.child("verify")
         return measure_gap(self.measurement, *versions, part, self.reference_sigma, self.most_sigmas, random)
 

@@ -67,18 +67,12 @@ class Evidence:
 
     @property
     def much_moved(self) -> bool:
-        """Whether so much of the wall moved that nothing can be said about the sensor.
-
-        By default, 20 % of the points must lie off the reference together with their neighbours.
-        """
+        """Whether so much of the wall moved (20 % of the points by default) that nothing can be said about the sensor."""
         return self.moved_share >= thresholds().changes.moved_share
 
     @property
     def misfit_is_significant(self) -> bool:
-        """Whether the misfit that the named effects leave is larger than chance makes it.
-
-        Its p-value must be at most 0.01 by default.
-        """
+        """Whether the misfit that the named effects leave is larger than chance makes it: p-value at most 0.01 by default."""
         return self.p_value is not None and self.p_value <= thresholds().verdict.rejection_p
 
     @property
@@ -108,9 +102,10 @@ class Evidence:
         uncertainty. Second, the score is worse with the effects than without, and the remaining misfit is significant.
         """
         gap = self.gap
-        if gap is not None and gap.after > gap.before and self.misfit_is_significant:
-            return True
-        return gap is not None and gap.closed is not None and gap.left_open and self.closes_little
+        if gap is None:
+            return False
+        worse = gap.after > gap.before and self.misfit_is_significant
+        return worse or (gap.closed is not None and gap.left_open and self.closes_little)
 
     @property
     def misfit_stays(self) -> bool:
@@ -136,8 +131,7 @@ class Evidence:
         The required share is the threshold `verdict.least_closed`, by default one half. Also true if the gap is too small to be
         measured.
         """
-        gap = self.gap
-        by = thresholds().verdict
+        gap, by = self.gap, thresholds().verdict
         if gap is None or gap.closed is None:
             return True
         return gap.before - gap.after + by.gap_sigmas * gap.error < by.least_closed * (gap.before - gap.floor)
@@ -195,26 +189,21 @@ def verdict_sentence(verdict: str, named: Sequence[NamedEffect], evidence: Evide
     if verdict in ("no_gap", "unknown") and evidence.only_noise_too_large(named):
         return TOO_NOISY
     kinds = {item.kind for item in named}
-    if verdict == "unknown" and len(kinds) > 1:
-        return PARTLY_EXPLAINED
-    if verdict == "unknown" and "empirical" not in kinds:
-        if not named:
-            return NOT_DESCRIBED
-        if evidence.gap_stays_open:
-            return STILL_OPEN
-        if evidence.effects_unsupported:
-            return UNSUPPORTED
-        return STILL_REJECTED if evidence.misfit_stays else STILL_OVERDISPERSED
-    return VERDICTS[verdict]
+    if verdict != "unknown" or kinds == {"empirical"}:
+        return VERDICTS[verdict]
+    if len(kinds) != 1:
+        return PARTLY_EXPLAINED if kinds else NOT_DESCRIBED
+    if evidence.gap_stays_open:
+        return STILL_OPEN
+    if evidence.effects_unsupported:
+        return UNSUPPORTED
+    return STILL_REJECTED if evidence.misfit_stays else STILL_OVERDISPERSED
 
 
 def describe_misfit(named: Sequence[NamedEffect], evidence: Evidence) -> str:
-    """Return a sentence for the report on the misfit that the named effects (sensor errors) leave; "" if it may be chance.
+    """Return a sentence for the report on the misfit that the named effects leave; "" if it may be chance, or without effects.
 
-    Parameters
-    ----------
-    named : the effects; without any, the sentence is "".
-    evidence : numbers that decide the verdict, with the misfit's p-value.
+    named: the effects (sensor errors). evidence: numbers that decide the verdict, with the misfit's p-value.
     """
     if not named or not evidence.misfit_is_significant:
         return ""
@@ -224,10 +213,7 @@ def describe_misfit(named: Sequence[NamedEffect], evidence: Evidence) -> str:
 def describe_closing(gap: Gap, model_changed: bool) -> str:
     """Say in words how much of the gap between model and measurement the named effects (sensor errors) close.
 
-    Parameters
-    ----------
-    gap : scores of the model without and with the effects, and the score that noise alone leaves.
-    model_changed : whether the diagnosis changed the model at all, by effects or by lower noise.
+    gap: scores of the model without and with the effects. model_changed: whether effects were named or the noise was lowered.
     """
     if gap.closed is None:
         return "before and floor differ by no more than their uncertainty"
@@ -240,14 +226,9 @@ def describe_closing(gap: Gap, model_changed: bool) -> str:
 def reduced_noise(model: TlsModel | StereoModel, noise_ratio: float) -> dict[str, float]:
     """Return noise values that fit the residuals, if a sensor model's noise is too large: all are lowered by the same factor.
 
-    Parameters
-    ----------
-    model : the sensor model.
-    noise_ratio : observed over predicted standard deviation of the residuals; below 1 if the noise is too large.
+    The lowered values have keys such as `range_sigma_m`; there are none if the noise is not too large.
 
-    Returns
-    -------
-    dict : lowered values by key, such as `range_sigma_m`; empty if the noise is not too large.
+    noise_ratio: observed over predicted standard deviation of the residuals; below 1 if the noise of the model is too large.
     """
     if noise_ratio >= 1.0:
         return {}
@@ -256,16 +237,9 @@ def reduced_noise(model: TlsModel | StereoModel, noise_ratio: float) -> dict[str
 
 
 def note_moved_wall(evidence: Evidence, stable_areas: bool) -> list[str]:
-    """Make the note for the report that much of the wall moved since the reference, with what to do about it.
+    """Make the note for the report that much of the wall moved since the reference, with what to do about it; none if not so.
 
-    Parameters
-    ----------
-    evidence : numbers that decide the verdict, with the share of points that moved.
-    stable_areas : whether the measurement states areas where nothing moved.
-
-    Returns
-    -------
-    list : the note; empty if not much moved.
+    evidence: the numbers that decide the verdict. stable_areas: whether the measurement states areas where nothing moved.
     """
     if not evidence.much_moved:
         return []
@@ -281,14 +255,7 @@ def note_moved_wall(evidence: Evidence, stable_areas: bool) -> list[str]:
 def note_overdispersion(evidence: Evidence, notes: Sequence[str]) -> list[str]:
     """Make the note for the report that the residuals have much more variance than the sensor model predicts.
 
-    Parameters
-    ----------
-    evidence : numbers that decide the verdict, with the observed over the predicted standard deviation.
-    notes : the other notes.
-
-    Returns
-    -------
-    list : the note; empty if the variance is not that large, or if another note says so already.
+    evidence: the numbers that decide the verdict. notes: the other notes; if one says so already, none is made.
     """
     if not evidence.is_overdispersed or any("the predicted standard deviation" in note for note in notes):
         return []
@@ -301,14 +268,8 @@ def note_overdispersion(evidence: Evidence, notes: Sequence[str]) -> list[str]:
 def note_excess_noise(noise_ratio: float, lower: dict[str, float]) -> list[str]:
     """Make the note for the report that the sensor model's noise is too large.
 
-    Parameters
-    ----------
-    noise_ratio : observed over predicted standard deviation of the residuals.
-    lower : noise values that would fit, by key such as `range_sigma_m`.
-
-    Returns
-    -------
-    list : the note; empty if the ratio is not below 1.
+    noise_ratio: observed over predicted standard deviation; from 1 on there is no note. lower: noise values that would fit, by
+    key such as `range_sigma_m`.
     """
     if noise_ratio >= 1.0:
         return []

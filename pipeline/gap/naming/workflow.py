@@ -94,7 +94,6 @@ class GapDiagnosis:
     remaining : what the effects leave unexplained: p-value, noise and outliers, as the entry `remaining` of gap.json.
     identifiability : table with three keys: `names` of systematic effects; `cosines` between their signatures, the patterns of
         residuals that they make; and `survival`, the share of each signature that is left after the pose is fitted.
-    seconds : duration of the whole diagnosis, s.
     timings : duration of each step by its name, s.
     unseen : effects that were not named, each with the size that would have shown with a probability of 95 %.
     reference_sigma : estimated standard deviation of the reference's correlated error, in the unit of the observable.
@@ -115,7 +114,6 @@ class GapDiagnosis:
     variance_tried: tuple[VarianceScore, ...]
     remaining: dict[str, Any]
     identifiability: dict[str, Any]
-    seconds: float
     timings: dict[str, float]
     unseen: tuple[DetectableSize, ...] = ()
     reference_sigma: float = 0.0
@@ -126,6 +124,11 @@ class GapDiagnosis:
         """The numbers that decided the verdict: scores on validation points, p-value, noise, and share of points that moved."""
         keys = ("p_value", "spread", "far", "moved", "wide")  # in the order of the fields of Evidence
         return Evidence(self.gap, *(self.remaining[key] for key in keys))
+
+    @property
+    def seconds(self) -> float:
+        """Duration of the whole diagnosis, s."""
+        return sum(self.timings.values())
 
     @property
     def model_changed(self) -> bool:
@@ -165,11 +168,11 @@ def diagnose(
 
 def _diagnose(measurement: Measurement, clock: _Clock, random: KeyedRandom) -> GapDiagnosis:
     """Run the steps of the workflow on the subsampled measurement."""
-    aligned, plain, surveyed, held_out_points, blocks = _aligned(measurement)
+    inputs, surveyed = _aligned(measurement)
+    aligned, plain = inputs.measurement, inputs.plain
     clock.lap("residuals")
     if plain.usable.sum() < thresholds().points.fewest:
         return _insufficient_data(measurement, plain, surveyed, clock)
-    inputs = PassInputs(aligned, plain, held_out_points, blocks)
     validated = _select_and_validate(inputs, random)
     clock.lap("naming")
     validated, validation, result, harmful = _with_gap(inputs, validated, random)
@@ -186,6 +189,7 @@ def _diagnose(measurement: Measurement, clock: _Clock, random: KeyedRandom) -> G
     if evidence.much_moved:
         result, _ = replace(validation, reduced_noise={}).validate([])
         notes = [*note_moved_wall(evidence, bool(aligned.stable_areas)), *selection.notes]
+    findings_first = sorted(notes, key=lambda note: note in plain.notes)  # then what the data cannot show
     value = plain.value - plain.pose_jacobian @ validation.pose
     clock.lap("validation")
     return GapDiagnosis(
@@ -201,9 +205,8 @@ def _diagnose(measurement: Measurement, clock: _Clock, random: KeyedRandom) -> G
         gap=result.gap,
         tried=selection.tried,
         variance_tried=selection.variance_tried,
-        remaining=_remaining_entry(evidence, _findings_first(notes, plain.notes), result.reduced_noise),
+        remaining=_remaining_entry(evidence, findings_first, result.reduced_noise),
         identifiability=selection.identifiability,
-        seconds=clock.total,
         timings=clock.laps,
         unseen=unseen_effects(plain, selection.detectable(), [item.name.partition(".")[2] for item in result.named]),
         reference_sigma=selection.reference_sigma,
@@ -211,14 +214,8 @@ def _diagnose(measurement: Measurement, clock: _Clock, random: KeyedRandom) -> G
     )
 
 
-def _aligned(measurement: Measurement) -> tuple[Measurement, Residuals, FloatArray, BoolArray, BlockGrid]:
-    """Estimate the pose and compute the residuals.
-
-    Returns
-    -------
-    The measurement at that pose, its residuals, the pose, the (N,) points of the measurement that are kept
-    for validation, and the wall blocks to which they belong.
-    """
+def _aligned(measurement: Measurement) -> tuple[PassInputs, FloatArray]:
+    """Estimate the pose, compute the residuals and choose the validation points; return these, and the pose."""
     measurement.check_near(FILE)
     initial = compute_residuals(measurement)
     check_noise("surface" if isinstance(initial, SurfaceResiduals) else initial.sensor, initial.sigma)
@@ -234,7 +231,7 @@ def _aligned(measurement: Measurement) -> tuple[Measurement, Residuals, FloatArr
         aligned = with_surroundings(aligned, plain)
     if isinstance(aligned, TlsMeasurement) and isinstance(plain, TlsResiduals):
         plain = replace(plain, expected_pulses=find_expected_pulses(aligned, plain))
-    return aligned, plain, pose, held_out_points, blocks
+    return PassInputs(aligned, plain, held_out_points, blocks), pose
 
 
 def _with_gap(
@@ -250,7 +247,7 @@ def _with_gap(
     """
     validation = _validation(inputs, validated, random)
     result, harmful = validation.validate(validated.named)
-    if _empirical(validated.named, but_not=result.named) and _nameable(inputs):
+    if _has_alternatives(inputs, [item for item in validated.named if item not in result.named]):
         again = _select_and_validate(inputs, random, frozenset({NONPARAMETRIC_TERMS}))
         validation_again = _validation(inputs, again, random)
         result_again, harmful_again = validation_again.validate(again.named)
@@ -289,14 +286,10 @@ def _validation(inputs: PassInputs, validated: _ValidatedSelection, random: Keye
     )
 
 
-def _empirical(named: Sequence[NamedEffect], but_not: Sequence[NamedEffect] = ()) -> bool:
-    """Whether an empirical term that is no noise is among some effects, but not among others."""
-    return any(item.kind == "empirical" and not item.adds_variance and item not in but_not for item in named)
-
-
-def _nameable(inputs: PassInputs) -> bool:
-    """Whether the catalogue has effects for these residuals."""
-    return any(not each.empirical for each in inputs.plain.candidates)
+def _has_alternatives(inputs: PassInputs, dropped: Sequence[NamedEffect]) -> bool:
+    """Whether a term among the dropped effects is empirical and no noise, and the catalogue has effects to try instead."""
+    curves = any(item.kind == "empirical" and not item.adds_variance for item in dropped)
+    return curves and any(not each.empirical for each in inputs.plain.candidates)
 
 
 def _share_of_model_noise(share: float, residuals: Residuals) -> float:
@@ -368,7 +361,7 @@ def _select_and_validate(
     named, words = only_within_bounds(aligned.model, named)
     scored = _validate(aligned, given, named, selection.reference_sigma, inputs.blocks).with_needed(selection)
     words += [f"{item.name} dropped: it does not improve the validation blocks" for item in scored.failed]
-    if NONPARAMETRIC_TERMS not in excluded and _empirical(scored.failed) and _nameable(inputs):
+    if NONPARAMETRIC_TERMS not in excluded and _has_alternatives(inputs, scored.failed):
         again = _select_and_validate(inputs, random, excluded | {NONPARAMETRIC_TERMS})
         if again.named:
             return replace(again, words=[*words, *(each for each in again.words if each not in words)])
@@ -433,8 +426,7 @@ class _Clock:
     """Measures how long each step takes, and reports the steps that are done."""
 
     def __init__(self, report: Callable[[str], None] | None) -> None:
-        self._start = self._last = time.perf_counter()
-        self._report = report
+        self._last, self._report = time.perf_counter(), report
         self.laps: dict[str, float] = {}
 
     def lap(self, name: str) -> None:
@@ -443,11 +435,6 @@ class _Clock:
         self.laps[name], self._last = now - self._last, now
         if self._report is not None:
             self._report(name)
-
-    @property
-    def total(self) -> float:
-        """Time since the start, s."""
-        return time.perf_counter() - self._start
 
 
 def _remaining_entry(evidence: Evidence, notes: list[str], lower_noise: dict[str, float]) -> dict[str, Any]:
@@ -466,11 +453,6 @@ def _remaining_entry(evidence: Evidence, notes: list[str], lower_noise: dict[str
     }
 
 
-def _findings_first(notes: list[str], about_data: Sequence[str]) -> list[str]:
-    """Order notes: findings first, then what the data cannot show."""
-    return [*(each for each in notes if each not in about_data), *(each for each in notes if each in about_data)]
-
-
 def _insufficient_data(measurement: Measurement, residuals: Residuals, pose: FloatArray, clock: _Clock) -> GapDiagnosis:
     """Return the diagnosis of a measurement with too few points. pose: the estimated one, as in the diagnosis."""
     count, least = int(residuals.usable.sum()), thresholds().points.fewest
@@ -479,7 +461,7 @@ def _insufficient_data(measurement: Measurement, residuals: Residuals, pose: Flo
     return GapDiagnosis(
         "insufficient_data", (), (), residuals, empty > 1, residuals.value, residuals.value, pose, measurement.model,
         None, (), (), _remaining_entry(Evidence(None, None), [note], {}), {"names": [], "cosines": [], "survival": []},
-        clock.total, clock.laps, thresholds=thresholds(),
+        clock.laps, thresholds=thresholds(),
     )  # fmt: skip
 
 

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from functools import cache, cached_property, partial
+from functools import cache, partial
+from itertools import product
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.formats.measurements.measurement import TlsMeasurement
-from pipeline.gap.noise_and_edges.edge_effects import EdgeEffect, WallBlocks, log_density, maximise_gain
+from pipeline.gap.noise_and_edges.edge_effects import EdgeEffect, agreed_gain, block_std, edge_blocks, log_density, maximise_gain
 from pipeline.gap.residuals.residuals import BoolArray
 from pipeline.gap.residuals.scan_simulation import simulate_ranges, simulate_ranges_by_mode, systematic_part
 from pipeline.gap.residuals.tls_residuals import TlsResiduals
@@ -56,31 +56,38 @@ def find_footprint(
     -------
     list : one edge effect with the divergence; empty if none is significant.
     """
-    sigma, footprint = noise_ratio * residuals.sigma, _FootprintSimulation(measurement, residuals)
-    every = slice(None, None, max(len(residuals) // _MOST_POINTS, 1))
-    rows = np.flatnonzero(~held_out)[every]
-    widest_shift = footprint.shift(rows, ("mean",), _DIVERGENCES_RAD[-1])["mean"]
+    sigma, plain = noise_ratio * residuals.sigma, systematic_part(measurement.model)
+    axis = simulate_ranges(measurement, plain, residuals.geometry, _RANDOM)
+
+    def shift(at: NDArray[np.int64], modes: tuple[Mode, ...], angle: float) -> dict[Mode, FloatArray]:
+        """(m,) range of a beam of divergence `angle` minus that of its axis, m, for each mode; 0 where either does not return."""
+        beam = plain.model_copy(update={"effects": (*plain.effects, BeamDivergence(divergence_rad=angle))})
+        whole = simulate_ranges_by_mode(measurement, beam, modes, residuals.geometry.part(at), _RANDOM)
+        return {mode: np.asarray(np.nan_to_num(whole[mode] - axis[at])) for mode in modes}
+
+    rows = np.flatnonzero(~held_out)[:: max(len(residuals) // _MOST_POINTS, 1)]
+    widest_shift = shift(rows, ("mean",), _DIVERGENCES_RAD[-1])["mean"]
     rows = rows[np.abs(widest_shift) > sigma[rows]]
     if not len(rows):
         return []
-    blocks = WallBlocks(WallBlocks.over(residuals.wall_xy).number[rows])
-    jittered = footprint.shift(rows, ("mean",), _equivalent_divergence(measurement.model))["mean"]
+    block = edge_blocks(residuals.wall_xy)[rows]
+    jittered = shift(rows, ("mean",), _equivalent_divergence(measurement.model))["mean"]
     without = [log_density(registered_residuals[rows], moved, sigma[rows]) for moved in (np.zeros_like(jittered), jittered)]
     null = np.logaddexp(*without) - np.log(2)  # the first holds at a step, the second on a curved slope
-    shift_by = cache(partial(footprint.shift, rows, _MODES))
+    shift_by = cache(partial(shift, rows, _MODES))
 
     def gains(mode: Mode, divergence_rad: float) -> FloatArray:
         moved = shift_by(divergence_rad)[mode]
         return np.asarray(log_density(registered_residuals[rows], moved, sigma[rows]) - null)
 
-    best_divergence = {mode: maximise_gain(partial(gains, mode), _DIVERGENCES_RAD, ()) for mode in _MODES}
-    mode = max(best_divergence, key=lambda each: float(gains(each, best_divergence[each]).sum()))
-    gain = blocks.total_if_agreed(gains(mode, best_divergence[mode]), thresholds().edges.least_block_sigmas)
+    mode, first = max(product(_MODES, _DIVERGENCES_RAD), key=lambda each: float(gains(*each).sum()))
+    gain = agreed_gain(gains(mode, first), block, thresholds().edges.least_block_sigmas)
     if gain is None:
         return []
-    divergence = maximise_gain(partial(gains, mode), [best_divergence[mode]], _REFINEMENT_FACTORS)
-    std = {"divergence_rad": float(np.hypot(blocks.std(partial(gains, mode), divergence), _PROFILE_UNCERTAINTY * divergence))}
-    touched = np.abs(footprint.shift(np.arange(len(residuals)), (mode,), 1.5 * divergence)[mode]) > sigma
+    divergence = maximise_gain(partial(gains, mode), [first], _REFINEMENT_FACTORS)
+    from_blocks = block_std(partial(gains, mode), block, divergence)
+    std = {"divergence_rad": float(np.hypot(from_blocks, _PROFILE_UNCERTAINTY * divergence))}
+    touched = np.abs(shift(np.arange(len(residuals)), (mode,), 1.5 * divergence)[mode]) > sigma
     return [EdgeEffect(BeamDivergence(divergence_rad=divergence, mode=mode), std, gain, touched)]
 
 
@@ -93,23 +100,3 @@ def _equivalent_divergence(model: TlsModel) -> float:
     noises = [each for each in model.chain() if isinstance(each, AngleNoise)]
     both = sum(each.azimuth_sigma_rad**2 + each.zenith_sigma_rad**2 for each in noises)
     return 4 * float(np.sqrt(both / 2))
-
-
-@dataclass(frozen=True)
-class _FootprintSimulation:
-    """Simulates how a beam's divergence changes the ranges of a scan."""
-
-    measurement: TlsMeasurement
-    residuals: TlsResiduals
-
-    @cached_property
-    def _axis(self) -> FloatArray:
-        """(n,) ranges along the beams' axes, m."""
-        return simulate_ranges(self.measurement, systematic_part(self.measurement.model), self.residuals.geometry, _RANDOM)
-
-    def shift(self, rows: NDArray[np.int64], modes: tuple[Mode, ...], angle: float) -> dict[Mode, FloatArray]:
-        """(m,) range of a beam of divergence `angle` minus that of its axis, m, for each mode; 0 where either does not return."""
-        plain = systematic_part(self.measurement.model)
-        beam = plain.model_copy(update={"effects": (*plain.effects, BeamDivergence(divergence_rad=angle))})
-        whole = simulate_ranges_by_mode(self.measurement, beam, modes, self.residuals.geometry.part(rows), _RANDOM)
-        return {mode: np.asarray(np.nan_to_num(whole[mode] - self._axis[rows])) for mode in modes}

@@ -16,7 +16,8 @@ from numpy.typing import NDArray
 
 from pipeline.change.robust import nmad
 from pipeline.formats.measurements.measurement import Measurement, StereoMeasurement
-from pipeline.gap.noise_and_edges.edge_effects import EdgeEffect, WallBlocks, log_density, maximise_gain
+from pipeline.gap.noise_and_edges.edge_effects import EdgeEffect, agreed_gain, block_std, edge_blocks, log_density, maximise_gain
+from pipeline.gap.noise_and_edges.missing_returns import bernoulli_log_likelihood
 from pipeline.gap.residuals.alignment import AlignedMeasurement, RobustPoseFit, align, compute_residuals, fit_pose_robustly
 from pipeline.gap.residuals.disparity_raster import DisparityRaster
 from pipeline.gap.residuals.residuals import BoolArray, Residuals
@@ -27,7 +28,6 @@ from scene.geometry.mesh import FloatArray
 from sensors.effects.base import Effect
 from sensors.effects.edge_fattening import EdgeFattening
 from sensors.effects.occlusion_fill import OcclusionFill
-from sensors.effects.raster_effect import RasterEffect
 from sensors.effects.smoothing import Smoothing
 
 _TRIED = 50_000
@@ -66,20 +66,16 @@ class _EdgeData:
     ----------
     residuals : residuals without edge effects.
     raster : raster of the measured disparities.
-    disparity : (n,) disparities of the reference, px.
     registered_residuals : (n,) residuals after a robust pose fit, px.
     sigma : (n,) their standard deviations, px.
-    blocks : wall blocks.
     held_out : (n,) points that must not be used.
-    beside : known edge effects.
+    beside : known effects, of which the edge effects count.
     """
 
     residuals: StereoResiduals
     raster: DisparityRaster
-    disparity: FloatArray
     registered_residuals: FloatArray
     sigma: FloatArray
-    blocks: WallBlocks
     held_out: BoolArray
     beside: list[Effect]
 
@@ -91,32 +87,33 @@ class _EdgeData:
         residuals: StereoResiduals,
         registered_residuals: FloatArray,
         held_out: BoolArray,
-    ) -> tuple[_EdgeData, NDArray[np.int64]]:
-        """Gather what a search needs, and return it with the numbers of its points among those of the residuals."""
+    ) -> _EdgeData:
+        """Gather what a search needs; of a large raster only a part of the points is kept."""
         scale = nmad((registered_residuals / residuals.sigma)[residuals.usable], 0.0)
-        known: list[Effect] = [effect for effect in measurement.model.effects if isinstance(effect, RasterEffect)]
+        known: list[Effect] = [*measurement.model.effects]
         known_shift = raster.added_by(known, residuals.geometry.disparity)
         search_raster, points = raster.search_part()
         part = residuals.part(points)
-        return cls(
-            replace(part, value=part.value + known_shift[points]),
-            search_raster,
-            part.geometry.disparity,
-            (registered_residuals + known_shift)[points],
-            scale * part.sigma,
-            WallBlocks.over(part.wall_xy),
-            held_out[points],
-            known,
-        ), points
+        part = replace(part, value=part.value + known_shift[points])
+        registered = (registered_residuals + known_shift)[points]
+        return cls(part, search_raster, registered, scale * part.sigma, held_out[points], known)
 
     def for_trials(self) -> _EdgeData:
         """Return the data at evenly spaced ones of many points, at which values of an effect's parameters are tried."""
-        every = slice(None, None, max(len(self.sigma) // _TRIED, 1))
-        part = self.residuals.part(np.arange(len(self.sigma))[every])
-        raster = replace(self.raster, row=self.raster.row[every], column=self.raster.column[every])
-        disparity, registered, sigma = (each[every] for each in (self.disparity, self.registered_residuals, self.sigma))
-        blocks = WallBlocks.over(part.wall_xy)
-        return _EdgeData(part, raster, disparity, registered, sigma, blocks, self.held_out[every], self.beside)
+        every = np.arange(0, len(self.sigma), max(len(self.sigma) // _TRIED, 1))
+        return replace(
+            self,
+            residuals=self.residuals.part(every),
+            raster=replace(self.raster, row=self.raster.row[every], column=self.raster.column[every]),
+            registered_residuals=self.registered_residuals[every],
+            sigma=self.sigma[every],
+            held_out=self.held_out[every],
+        )
+
+    @cached_property
+    def block(self) -> NDArray[np.int64]:
+        """(n,) number of each point's wall block; wall blocks must agree on an effect."""
+        return edge_blocks(self.residuals.wall_xy)
 
     @cached_property
     def shift_without(self) -> FloatArray:
@@ -124,24 +121,20 @@ class _EdgeData:
         return self.shift([])
 
     @cached_property
-    def density(self) -> FloatArray:
-        """(n,) log density of the residuals with the known effects alone."""
-        return log_density(self.registered_residuals, self.shift_without, self.sigma)
-
-    @cached_property
     def _pose_fit(self) -> RobustPoseFit:
         return RobustPoseFit.of(self.residuals)
 
     def shift(self, effects: list[Effect]) -> FloatArray:
         """(n,) change of the disparities by the known effects and further ones, px."""
-        return self.raster.added_by([*self.beside, *effects], self.disparity)
+        return self.raster.added_by([*self.beside, *effects], self.residuals.geometry.disparity)
 
     def gains(self, effect: Effect) -> FloatArray:
         """(n,) log-likelihood ratio of an effect beside the known ones."""
         shift = self.shift([effect])
         rows = np.flatnonzero((shift != self.shift_without) & ~self.held_out)
         gains = np.zeros(len(shift))
-        gains[rows] = log_density(self.registered_residuals[rows], shift[rows], self.sigma[rows]) - self.density[rows]
+        value, sigma = self.registered_residuals[rows], self.sigma[rows]
+        gains[rows] = log_density(value, shift[rows], sigma) - log_density(value, self.shift_without[rows], sigma)
         return gains
 
     def _registered(self, effects: list[Effect]) -> tuple[FloatArray, FloatArray, FloatArray]:
@@ -193,10 +186,6 @@ class _EdgeData:
         value, _, sigma = self._registered([effect])
         return replace(self, registered_residuals=value, sigma=sigma)
 
-    def likelier(self, found: list[EdgeEffect]) -> EdgeEffect:
-        """Return the more likely of effects that can imitate each other."""
-        return max(found, key=lambda each: float(self.registered_density([each.effect]).sum()))
-
 
 def find_disparity_edge_effects(
     measurement: StereoMeasurement, residuals: StereoResiduals, registered_residuals: FloatArray, held_out: BoolArray
@@ -220,9 +209,9 @@ def find_disparity_edge_effects(
     raster = DisparityRaster.of(measurement, residuals.geometry)
     if raster is None:
         return []
-    data, points = _EdgeData.of(measurement, raster, residuals, registered_residuals, held_out)
+    data = _EdgeData.of(measurement, raster, residuals, registered_residuals, held_out)
     found = _search(data)
-    if len(points) == len(registered_residuals):
+    if len(data.sigma) == len(registered_residuals):
         return found
     before = ([*data.beside, *(each.effect for each in found[:count])] for count in range(len(found)))
     return [
@@ -234,28 +223,24 @@ def find_disparity_edge_effects(
 def _search(data: _EdgeData) -> list[EdgeEffect]:
     """Find the edge effects of some data, each beside those found before."""
     found: list[EdgeEffect] = []
-
-    def smoothing(untouched: _EdgeData) -> EdgeEffect | None:
-        touched = np.any([np.zeros(len(untouched.sigma), dtype=bool), *(each.touched for each in found)], axis=0)
-        return _find_smoothing(replace(untouched, held_out=untouched.held_out | touched))
-
     searches: dict[str, Callable[[_EdgeData], EdgeEffect | None]] = {
         EdgeFattening.tag(): _find_fattening,
-        Smoothing.tag(): smoothing,
+        Smoothing.tag(): _find_smoothing,
         OcclusionFill.tag(): _find_filling,
     }
-    for name in {effect.name for effect in data.beside}:
-        del searches[name]
+    for effect in data.beside:
+        searches.pop(effect.name, None)
     while searches:
         current = replace(data, beside=[*data.beside, *(each.effect for each in found)])
-        found_now = map_in_threads(call, [partial(search, current) for search in searches.values()])
+        untouched = replace(current, held_out=np.any([data.held_out, *(each.touched for each in found)], axis=0))
+        calls = [partial(find, untouched if find is _find_smoothing else current) for find in searches.values()]
         # no prediction is exact, so a further effect must explain more than the inexact part of those before
         needed = thresholds().mean.class_share * max([0.0, *(each.gain for each in found)])
-        tried = {name: each for name, each in zip(searches, found_now, strict=True) if each is not None and each.gain > needed}
+        tried = {each.name: each for each in map_in_threads(call, calls) if each is not None and each.gain > needed}
         if not tried:
             break
         similar = [tried.pop(name) for name in (EdgeFattening.tag(), Smoothing.tag()) if name in tried]
-        likelier = [current.likelier(similar)] if similar else []
+        likelier = sorted(similar, key=lambda each: -float(current.registered_density([each.effect]).sum()))[:1]
         found.append(max([*likelier, *tried.values()], key=lambda each: each.gain))
         del searches[found[-1].name]
     return found
@@ -306,7 +291,7 @@ def _gather_trusted(measurement: Measurement, residuals: Residuals, trusted: NDA
     if raster is None:
         return None
     held_out = ~np.isin(residuals.index, trusted)
-    return _EdgeData.of(measurement, raster, residuals, fit_pose_robustly(residuals)[0], held_out)[0]
+    return _EdgeData.of(measurement, raster, residuals, fit_pose_robustly(residuals)[0], held_out)
 
 
 def _log_likelihood_with_edge_effects(data: _EdgeData | None, count: int) -> float:
@@ -364,17 +349,15 @@ def _find_fattening(data: _EdgeData) -> EdgeEffect | None:
     """
     best = most_likely_fattening(data.for_trials())
 
-    def of_radius(cells: float) -> EdgeFattening:
-        return best.model_copy(update={"radius_px": (cells + _ROUNDED_CELLS[0]) * data.raster.step})
-
     def gains(cells: float) -> FloatArray:
-        return data.clear_gains(of_radius(cells)) if cells >= 1 else np.zeros(len(data.residuals))
+        trial = best.model_copy(update={"radius_px": (cells + _ROUNDED_CELLS[0]) * data.raster.step})
+        return data.clear_gains(trial) if cells >= 1 else np.zeros(len(data.residuals))
 
     radius = float(int(best.radius_px / data.raster.step))
-    gain = data.blocks.total_if_agreed(gains(radius), by_signs=True)  # depth steps may occur in few places only
+    gain = agreed_gain(gains(radius), data.block, by_signs=True)  # depth steps may occur in few places only
     if gain is None:
         return None
-    radius_error = min(data.blocks.std(gains, radius, 1.0), radius)
+    radius_error = min(block_std(gains, data.block, radius, 1.0), radius)
     std = {"radius_px": data.raster.step * float(np.hypot(_ROUNDED_CELLS[1], radius_error))}
     return data.edge_effect(best, std, gain)
 
@@ -431,16 +414,16 @@ def _find_smoothing(data: _EdgeData) -> EdgeEffect | None:
         return at.gains(Smoothing(sigma_px=sigma))
 
     sigma = maximise_gain(partial(gains, at=few), [step * each for each in _SIGMAS], _REFINEMENT_FACTORS)
-    if data.blocks.total_if_agreed(gains(sigma, data)) is None:
+    if agreed_gain(gains(sigma, data), data.block) is None:
         return None
     for _ in range(_REGISTRATIONS):  # the first registration and noise estimate absorb part of the low-pass
         few = few.registered_with(Smoothing(sigma_px=sigma))
         sigma = maximise_gain(partial(gains, at=few), [sigma], _REFINEMENT_FACTORS)
     data = data.registered_with(Smoothing(sigma_px=sigma))
-    gain = data.blocks.total_if_agreed(gains(sigma, data))
+    gain = agreed_gain(gains(sigma, data), data.block)
     if gain is None:
         return None
-    std = float(np.hypot(data.blocks.std(partial(gains, at=data), sigma), _SMOOTHING_UNCERTAINTY * sigma))
+    std = float(np.hypot(block_std(partial(gains, at=data), data.block, sigma), _SMOOTHING_UNCERTAINTY * sigma))
     return data.edge_effect(Smoothing(sigma_px=sigma), {"sigma_px": std}, gain)
 
 
@@ -454,41 +437,31 @@ def _find_filling(data: _EdgeData) -> EdgeEffect | None:
     gain = float(data.gains(OcclusionFill(reach_px=1e5))[points].sum())
     if points.sum() < thresholds().changes.fewest or gain < thresholds().edges.least_gain:
         return None
-    widths, held = _occluded_strips(raster.apply(data.beside), raster)
-    reach, std = _estimate_reach(widths, held, raster.step)
-    narrow = held[widths <= reach / raster.step]
-    if narrow.mean() < thresholds().edges.least_filled_share:
+    held = np.zeros(raster.disparity.shape, dtype=bool)
+    held[raster.row, raster.column] = True
+    widths = _gap_widths(raster.apply(data.beside))
+    inside = (widths > 0) & raster.hidden
+    reach, std = _estimate_reach(widths[inside], held[inside], raster.step)
+    if held[inside & (widths <= reach / raster.step)].mean() < thresholds().edges.least_filled_share:
         return None
     return data.edge_effect(OcclusionFill(reach_px=reach), {"reach_px": std}, gain)
 
 
-def _occluded_strips(before: FloatArray, raster: DisparityRaster) -> tuple[NDArray[np.int64], BoolArray]:
-    """Width in cells of the strip of each half-occluded cell, and whether the cell holds a point."""
-    held = np.zeros(before.shape, dtype=bool)
-    held[raster.row, raster.column] = True
-    width = _gap_widths(before)
-    inside = (width > 0) & raster.hidden
-    return width[inside], held[inside]
-
-
 def _estimate_reach(widths: NDArray[np.int64], held: BoolArray, step: float) -> tuple[float, float]:
-    """Widest strip that is filled and its standard deviation, px, from which strips hold points.
+    """Widest strip that is filled and its standard deviation, px, from which half-occluded cells hold points.
 
     If all do, the widest strip is a lower bound. The excess over it has an exponential prior with the typical size as mean.
+
+    widths: (k,) widths in cells of the strips in which the cells lie; held: (k,) whether each holds a point.
     """
     tried = np.unique(widths)
-    best = int(np.argmax([_log_likelihood(held, widths <= each) for each in tried]))
+    chances = (np.where(widths <= each, _FILLED_SHARE, _STRAY_SHARE) for each in tried)
+    best = int(np.argmax([bernoulli_log_likelihood(held, chance) for chance in chances]))
     low = float(tried[best])
     if best + 1 == len(tried):
         typical = OcclusionFill.typical_sizes()["reach_px"]
         return (low + 0.5) * step + typical, typical
     return (low + tried[best + 1]) / 2 * step, (tried[best + 1] - low) / np.sqrt(12) * step
-
-
-def _log_likelihood(held: BoolArray, filled: BoolArray) -> float:
-    """Log-likelihood of cells that hold points or not, given which strips are filled."""
-    chance = np.where(filled, _FILLED_SHARE, _STRAY_SHARE)
-    return float(np.sum(np.log(np.where(held, chance, 1 - chance))))
 
 
 def _gap_widths(disparity: FloatArray) -> NDArray[np.int64]:

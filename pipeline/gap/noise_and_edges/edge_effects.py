@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.gap.residuals.residuals import BoolArray
-from pipeline.gap.residuals.wall_blocks import wall_blocks_by_points
+from pipeline.gap.residuals.wall_blocks import agreement, wall_blocks_by_points
 from pipeline.gap.thresholds import thresholds
 from scene.geometry.mesh import FloatArray
 from sensors.effects.base import Effect
@@ -27,11 +27,10 @@ class EdgeEffect:
 
     Attributes
     ----------
-    effect : the effect (of the known sensor effects) with its estimated parameters.
+    effect : the effect with its estimated parameters.
     std : standard deviations of its parameters, by parameter name.
     gain : log-likelihood ratio of the models with and without it.
-    touched : (n,) true for points whose shift by the effect cannot be predicted as precisely as the noise. Other fits leave
-        them out.
+    touched : (n,) points whose shift by the effect cannot be predicted as precisely as the noise. Other fits leave them out.
     """
 
     effect: Effect
@@ -45,80 +44,53 @@ class EdgeEffect:
         return self.effect.name
 
 
-@dataclass(frozen=True)
-class WallBlocks:
-    """Division of the wall into squares of about a hundred points, to test whether an edge effect shows all over the wall.
+def edge_blocks(at: FloatArray) -> NDArray[np.int64]:
+    """Divide the wall into squares (wall blocks) of about a hundred points, and return the number of that of each point (n,).
 
-    Residuals are correlated within such a wall block, so wall blocks and not points count as independent. An effect is accepted
-    only if they agree on it.
+    Residuals are correlated within such a block, so blocks and not points count as independent in tests of edge effects.
 
-    Attributes
-    ----------
-    number : (n,) number of the wall block in which each point lies.
+    at: (n, 2) positions of the points, x along the wall and y up, wall frame, m.
     """
+    return wall_blocks_by_points(at, _POINTS_PER_BLOCK)
 
-    number: NDArray[np.int64]
 
-    @classmethod
-    def over(cls, at: FloatArray) -> WallBlocks:
-        """Divide the wall into squares of about a hundred points, which count as independent in tests of edge effects.
+def agreed_gain(
+    gains: FloatArray, block: NDArray[np.int64], least_sigmas: float | None = None, *, by_signs: bool = False
+) -> float | None:
+    """Test an edge effect: return its log-likelihood ratio if it is large enough and the wall blocks agree, else None.
 
-        at: (n, 2) positions of the points, x along the wall and y up, wall frame, m.
-        """
-        return cls(wall_blocks_by_points(at, _POINTS_PER_BLOCK))
+    Parameters
+    ----------
+    gains : (n,) log-likelihood ratio of each point: model with the effect against model without it.
+    block : (n,) number of each point's wall block, from `edge_blocks`.
+    least_sigmas : smallest `agreement` of the wall blocks that is accepted; None: the threshold `edges.block_sigmas`.
+    by_signs : whether agreement of the signs alone is enough, for effects of which a few wall blocks hold most of the points.
+    """
+    by, most = thresholds().edges, thresholds().mean.class_margin
+    total, sums = float(gains.sum()), np.bincount(block, np.clip(gains, -most, most))
+    sigmas = max(agreement(sums), agreement(np.sign(sums))) if by_signs else agreement(sums)
+    if total < by.least_gain or sigmas < (by.block_sigmas if least_sigmas is None else least_sigmas):
+        return None
+    return total
 
-    def sums(self, gains: FloatArray) -> FloatArray:
-        """Sum log-likelihood ratios of points over each wall block, to see whether all parts of the wall agree on an effect.
 
-        Parameters
-        ----------
-        gains : (n,) log-likelihood ratio of each point: model with the effect against model without it.
+def block_std(gains: Callable[[float], FloatArray], block: NDArray[np.int64], value: float, width: float | None = None) -> float:
+    """Return the standard deviation of an edge effect's parameter at its maximum-likelihood value.
 
-        Returns
-        -------
-        FloatArray : (b,) sums, one for each of b wall blocks.
-        """
-        return np.asarray(np.bincount(self.number, gains))
+    It comes from the scatter between wall blocks of the derivative of the log-likelihood (sandwich estimator), so points in a
+    wall block may be correlated.
 
-    def total_if_agreed(self, gains: FloatArray, least_sigmas: float | None = None, *, by_signs: bool = False) -> float | None:
-        """Test an edge effect: return its log-likelihood ratio if it is large enough and the wall blocks agree, else None.
-
-        Agreement is measured like a number of standard deviations: the sum of the wall blocks' ratios over the root of the sum
-        of their squares.
-
-        Parameters
-        ----------
-        gains : (n,) log-likelihood ratio of each point: model with the effect against model without it.
-        least_sigmas : smallest agreement that is accepted; None: the threshold `edges.block_sigmas`.
-        by_signs : whether agreement of the signs alone is enough, for effects of which a few wall blocks hold most of the
-            points.
-        """
-        by, most = thresholds().edges, thresholds().mean.class_margin
-        total, sums = float(gains.sum()), self.sums(np.clip(gains, -most, most))
-        sigmas = float(sums.sum()) / max(float(np.linalg.norm(sums)), 1e-12)
-        if by_signs:
-            signs = np.sign(sums[sums != 0])
-            sigmas = max(sigmas, float(signs.sum()) / max(float(np.linalg.norm(signs)), 1.0))
-        if total < by.least_gain or sigmas < (by.block_sigmas if least_sigmas is None else least_sigmas):
-            return None
-        return total
-
-    def std(self, gains: Callable[[float], FloatArray], value: float, width: float | None = None) -> float:
-        """Return the standard deviation of an edge effect's parameter at its maximum-likelihood value.
-
-        It comes from the scatter between wall blocks of the derivative of the log-likelihood (sandwich estimator). It is valid
-        although points in a wall block are correlated.
-
-        Parameters
-        ----------
-        gains : function from the parameter's value to the (n,) log-likelihood ratios of the points.
-        value : maximum-likelihood value of the parameter.
-        width : half-width of the finite differences, unit of the parameter; None: a twentieth of the value.
-        """
-        width = 0.05 * value if width is None else width
-        low, middle, high = (self.sums(gains(each)) for each in (value - width, value, value + width))
-        slopes, curvature = (high - low) / (2 * width), float((high - 2 * middle + low).sum()) / width**2
-        return float(np.linalg.norm(slopes)) / max(-curvature, 1e-12)
+    Parameters
+    ----------
+    gains : function from the parameter's value to the (n,) log-likelihood ratios of the points.
+    block : (n,) number of each point's wall block, from `edge_blocks`.
+    value : maximum-likelihood value of the parameter.
+    width : half-width of the finite differences, unit of the parameter; None: a twentieth of the value.
+    """
+    width = 0.05 * value if width is None else width
+    low, middle, high = (np.bincount(block, gains(each)) for each in (value - width, value, value + width))
+    slopes, curvature = (high - low) / (2 * width), float((high - 2 * middle + low).sum()) / width**2
+    return float(np.linalg.norm(slopes)) / max(-curvature, 1e-12)
 
 
 def log_density(registered_residuals: FloatArray, shift: FloatArray, sigma: FloatArray) -> FloatArray:
@@ -149,7 +121,7 @@ def maximise_gain(gains: Callable[[float], FloatArray], values: list[float], fac
     ----------
     gains : function from the parameter's value to the (n,) log-likelihood ratios of the points.
     values : values to try first.
-    factors : ratio of neighbouring values in each finer grid, coarsest first; empty: only `values` are tried.
+    factors : ratio of neighbouring values in each finer grid, coarsest first.
 
     Returns
     -------
@@ -164,4 +136,4 @@ def maximise_gain(gains: Callable[[float], FloatArray], values: list[float], fac
         curvature = low - 2 * middle + high
         step = float(np.clip(0.5 * (low - high) / curvature, -1.0, 1.0)) if curvature < 0 else 0.0
         best *= factor ** (top - 4)
-    return float(best * factors[-1] ** step) if factors else best
+    return float(best * factors[-1] ** step)

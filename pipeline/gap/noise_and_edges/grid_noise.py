@@ -12,6 +12,7 @@ l^2), which is small if its length l on the wall is short.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -86,7 +87,7 @@ class _Variogram:
         shares = weights[0] @ self.root @ self.blocks
         misfit_factor = np.sqrt(max(chi2 / (len(value) - columns.shape[1]), 1.0))  # larger than 1 if no shape fits
         error = max(misfit_factor * float(np.linalg.norm(weights[0])), float(np.linalg.norm(shares - shares.mean())))
-        return _VariogramFit(chi2, float(best[0]), error, shares)
+        return _VariogramFit(chi2, float(best[0]), error)
 
     def p_value(self, random: KeyedRandom) -> float:
         """Return the p-value (1 + b) / (1 + N) of the largest grid variance over its error, for any step.
@@ -96,7 +97,7 @@ class _Variogram:
         these very blocks.
         """
         size = np.linalg.norm(self.blocks, axis=1)
-        forms = (np.stack([_grid_semivariogram(self.lag, step), self._smooth], axis=1) for _, step in self._trials)
+        forms = (np.stack([self._grid(step), self._smooth], axis=1) for step in self._steps)
         weights = np.stack([np.linalg.pinv(shape / size[:, None])[0] / size for shape in forms])
         shares = weights @ self.blocks
         shares /= np.linalg.norm(shares, axis=1, keepdims=True)
@@ -105,10 +106,13 @@ class _Variogram:
         return float((1 + np.sum(largest >= np.max(shares.sum(axis=1)))) / (1 + _DRAWS))
 
     @property
-    def _trials(self) -> list[tuple[_VariogramFit, float]]:
-        """Fits of grids and their steps, px, for which the raster is fine enough."""
-        finest = _FINEST_GRID * self.step
-        return [(self.fitted(_grid_semivariogram(self.lag, step)), step) for step in _GRID_STEPS_PX if step >= finest]
+    def _steps(self) -> list[float]:
+        """Steps of grids, px, for which the raster is fine enough."""
+        return [step for step in _GRID_STEPS_PX if step >= _FINEST_GRID * self.step]
+
+    def _grid(self, step: float) -> FloatArray:
+        """(k,) semivariogram of grid noise whose nodes have variance 1."""
+        return RegularizationNoise(sigma_px=1.0, step_px=step).semivariogram(self.lag)
 
     @property
     def _smooth(self) -> FloatArray:
@@ -147,26 +151,19 @@ class _Variogram:
 
         None if all steps are too fine.
         """
-        trials = self._trials
-        if not trials:
-            return None
-        least = min(fit.chi2 for fit, _ in trials)
+        trials = [(self.fitted(self._grid(step)), step) for step in self._steps]
+        least = min((fit.chi2 for fit, _ in trials), default=np.inf)
         near = [trial for trial in trials if trial[0].chi2 < least + 1]
-        return *near[len(near) // 2], [step for _, step in near]
+        return (*near[len(near) // 2], [step for _, step in near]) if near else None
 
 
 @dataclass(frozen=True)
 class _VariogramFit:
-    """A fitted semivariogram.
-
-    chi2: chi^2 of the fit; variance, error: variance and its standard deviation, px^2; blocks: (b,) contributions to the
-    variance.
-    """
+    """A fitted semivariogram. chi2: chi^2 of the fit; variance, error: variance and its standard deviation, px^2."""
 
     chi2: float
     variance: float
     error: float
-    blocks: FloatArray
 
 
 def separate_white_and_grid_noise(
@@ -176,8 +173,8 @@ def separate_white_and_grid_noise(
 
     Grid-correlated noise comes from a stereo matcher that interpolates between widely spaced pixels (grid nodes). The
     semivariogram of the residuals decides. If it supports neither kind over the other, both are reported as indistinguishable.
-    Grid-correlated noise may also look like a variance that depends on a covariate such as the depth: points of similar depth
-    may belong to few nodes. It therefore replaces such an empirical term.
+    Grid-correlated noise also replaces a variance that depends on a covariate such as the depth, because points of similar
+    depth may belong to few nodes.
 
     Parameters
     ----------
@@ -190,7 +187,8 @@ def separate_white_and_grid_noise(
     -------
     list : the noise terms, white or grid-correlated, that the semivariogram supports.
     """
-    named = [_name_noise(replace(each, empirical=False), part, value, model) for each in found]
+    variogram = _variogram(part, value, model) if found else None
+    named = [_name_noise(replace(each, empirical=False), variogram) for each in found]
     return [old if old.empirical and new.effect == old.effect else new for old, new in zip(found, named, strict=True)]
 
 
@@ -199,14 +197,12 @@ def find_grid_noise(
 ) -> tuple[VarianceTerm | None, str]:
     """Find noise that neighbouring points share because the matcher interpolates it between widely spaced pixels (grid nodes).
 
-    Other noise terms are fitted to deviations from a plane within small squares of the wall. This noise hardly shows there,
-    because points near one node hardly differ by it. It needs a search of its own.
+    It needs a search of its own: points near one node hardly differ by it, so it hardly shows in the deviations from a plane
+    within small squares of the wall, to which other noise terms are fitted.
 
     Parameters
     ----------
-    part : disparity residuals of n points with their predicted standard deviations, px.
-    value : (n,) their values after the systematic effects are removed, px.
-    model : sensor model of the stereo pair.
+    part, value, model : arguments of `separate_white_and_grid_noise`.
     random : source of random numbers for the null distribution.
 
     Returns
@@ -239,10 +235,9 @@ def _describe_reference_error(fit: _VariogramFit, step: float, unit_m: float) ->
     )
 
 
-def _name_noise(white: VarianceTerm, part: StereoResiduals, value: FloatArray, model: StereoModel) -> VarianceTerm:
+def _name_noise(white: VarianceTerm, variogram: _Variogram | None) -> VarianceTerm:
     """The term of white noise, of grid noise, or of white noise with grid noise in its class."""
     both = replace(white, indistinguishable=tuple(sorted({*white.indistinguishable, RegularizationNoise.tag()})))
-    variogram = _variogram(part, value, model)
     if variogram is None:
         return both
     white_fit = variogram.fitted(np.ones(len(variogram.lag)))
@@ -295,11 +290,11 @@ def _variogram(part: StereoResiduals, value: FloatArray, model: StereoModel) -> 
     count = int(block.max()) + 1
     lags = [(axis, lag) for axis in (0, 1) for lag in _LAGS if lag * steps[axis] <= _LONGEST_LAG_PX[0]]
     pairs, sums = np.stack([_pairs_by_block(raster, block, lag, axis, count) for axis, lag in lags], axis=1)
-    near = _usable_lags(pairs, np.array([lag * steps[axis] for axis, lag in lags]))
-    lags = [each for each, is_near in zip(lags, near, strict=True) if is_near]
-    pairs, sums = pairs[near], sums[near]
+    offsets = np.array([[lag * steps[axis] * (axis == 1), lag * steps[axis] * (axis == 0)] for axis, lag in lags])
+    near = _usable_lags(pairs, offsets.sum(axis=1))
+    pairs, sums, offsets = pairs[near], sums[near], offsets[near]
     full = (pairs > 0).all(axis=0)
-    if full.sum() < _FEWEST_BLOCKS or len(lags) < 2 * _FEWEST_LAGS:
+    if full.sum() < _FEWEST_BLOCKS or len(offsets) < 2 * _FEWEST_LAGS:
         return None
     means = sums[:, full] / pairs[:, full]
     weight = pairs[:, full].sum(axis=0) / pairs[:, full].sum()
@@ -307,20 +302,13 @@ def _variogram(part: StereoResiduals, value: FloatArray, model: StereoModel) -> 
     left = (means - mean[:, None]) * np.sqrt(weight)
     covariance = left @ left.T / (1 - np.sum(weight**2)) * np.sum(weight**2)
     covariance += (_RIDGE + _SHRINKAGE_PER_LAG * len(mean) / means.shape[1]) * np.diag(np.diag(covariance))
-    offsets = np.array([[lag * steps[axis] * (axis == 1), lag * steps[axis] * (axis == 0)] for axis, lag in lags])
-    white = max(
-        float(np.median(part.sigma**2)) - model.variance, 0.0
-    )  # variance of effects that were found separately, such as pixel locking
+    # variance of effects that were found separately, such as pixel locking
+    white = max(float(np.median(part.sigma**2)) - model.variance, 0.0)
     blocks = (means - (model.semivariogram(offsets) + white)[:, None]) * weight
     root = np.linalg.inv(np.linalg.cholesky(covariance))
-    on_wall = np.linalg.norm(offsets, axis=1) * _wall_per_px(part)
+    metres_per_px = np.sqrt(np.prod(np.std(part.wall_xy, axis=0)) / (np.std(g.u) * np.std(g.v)))
+    on_wall = np.linalg.norm(offsets, axis=1) * float(metres_per_px)
     return _Variogram(max(steps), offsets, blocks, root, on_wall, float(np.median(part.unit_m)))
-
-
-def _wall_per_px(part: StereoResiduals) -> float:
-    """Metres on the wall per px of the image, mean of rows and columns."""
-    g = part.geometry
-    return float(np.sqrt(np.prod(np.std(part.wall_xy, axis=0)) / (np.std(g.u) * np.std(g.v))))
 
 
 def _usable_lags(pairs: FloatArray, length: FloatArray) -> BoolArray:
@@ -334,18 +322,10 @@ def _usable_lags(pairs: FloatArray, length: FloatArray) -> BoolArray:
 
 def _pairs_by_block(
     raster: FloatArray, block: NDArray[np.int64], lag: int, axis: int, count: int
-) -> tuple[FloatArray, FloatArray]:
+) -> tuple[NDArray[Any], NDArray[Any]]:
     """(count,) pairs and half their squared differences, by the wall block of the first of each pair."""
-    first, second = (raster[:-lag], raster[lag:]) if axis == 0 else (raster[:, :-lag], raster[:, lag:])
-    there = block[:-lag] if axis == 0 else block[:, :-lag]
-    half = 0.5 * (first - second) ** 2
+    first, second = ((*[slice(None)] * axis, rows) for rows in (slice(-lag), slice(lag, None)))
+    half = 0.5 * (raster[first] - raster[second]) ** 2
     known = np.isfinite(half)
-    return (
-        np.bincount(there[known], minlength=count).astype(np.float64),
-        np.bincount(there[known], half[known], count).astype(np.float64),
-    )
-
-
-def _grid_semivariogram(lag: FloatArray, step: float) -> FloatArray:
-    """(k,) semivariogram of grid noise whose nodes have variance 1."""
-    return RegularizationNoise(sigma_px=1.0, step_px=step).semivariogram(lag)
+    there = block[first][known]
+    return np.bincount(there, minlength=count), np.bincount(there, half[known], count)

@@ -21,8 +21,7 @@ class HeavyTails:
 
     Attributes
     ----------
-    share : share of all residuals beyond `limit_sigmas`.
-    limit_sigmas : number of standard deviations of the core beyond which a residual is an outlier.
+    share : share of all residuals beyond the threshold `variance.tail_sigmas`, in standard deviations of the core.
     sigma : standard deviation of the noise to be added to that of the core to explain the scatter of all residuals, in
         standard deviations of the core.
     gain : log-likelihood ratio of a mixture, in which this share of the residuals has larger noise, against normal noise.
@@ -31,7 +30,6 @@ class HeavyTails:
     """
 
     share: float
-    limit_sigmas: float
     sigma: float
     gain: float
     uniform: bool
@@ -39,8 +37,9 @@ class HeavyTails:
     @property
     def note(self) -> str:
         """Description of the excess outliers of the residuals, as a sentence for the report."""
+        limit = thresholds().variance.tail_sigmas
         where = "all over the wall" if self.uniform else "in parts of the wall, as at edges, plants or moved rock"
-        return f"{100 * self.share:.2g} % of the points lie beyond {self.limit_sigmas:g} standard deviations, {where}"
+        return f"{100 * self.share:.2g} % of the points lie beyond {limit:g} standard deviations, {where}"
 
 
 def find_heavy_tails(z: FloatArray, block: NDArray[np.int64]) -> HeavyTails | None:
@@ -62,7 +61,7 @@ def find_heavy_tails(z: FloatArray, block: NDArray[np.int64]) -> HeavyTails | No
     tail_variance = max(float(square[outlying].mean()), 1.0)
     mixed = np.log(1 - share + share / np.sqrt(tail_variance) * np.exp(0.5 * square * (1 - 1 / tail_variance)))
     sigma = float(np.sqrt(max(float(square.mean()) - 1, 0.0)))
-    return HeavyTails(share, by.tail_sigmas, sigma, float(mixed.sum()), _unevenness(outlying, block) < by.most_tail_unevenness)
+    return HeavyTails(share, sigma, float(mixed.sum()), _unevenness(outlying, block) < by.most_tail_unevenness)
 
 
 def _unevenness(outlying: BoolArray, block: NDArray[np.int64]) -> float:

@@ -4,14 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import minimize
 from scipy.special import expit, logit, ndtr
 
+from pipeline.gap.noise_and_edges.variance_fit import quantile_group
 from pipeline.gap.residuals.residuals import BoolArray, ExpectedPulses
-from pipeline.gap.residuals.wall_blocks import wall_blocks_by_points
+from pipeline.gap.residuals.wall_blocks import agreement, wall_blocks_by_points
 from pipeline.gap.thresholds import thresholds
 from scene.geometry.mesh import FloatArray
 from sensors.effects import catalogue
@@ -46,7 +47,6 @@ class LossExplanation:
     score : gain minus the number of parameters.
     parameters, std : values of the effect's parameters and their standard deviations, by parameter name.
     probability : (m,) probability of losing each pulse.
-    tried : names and scores of the explanations that were compared.
     covariate : name of the covariate, such as a direction, to which losses were fitted freely; else "".
     """
 
@@ -56,76 +56,49 @@ class LossExplanation:
     parameters: dict[str, float]
     std: dict[str, float]
     probability: FloatArray
-    tried: tuple[tuple[str, float], ...] = ()
     covariate: str = ""
 
 
 @dataclass(frozen=True)
-class LossData:
-    """Which of m laser pulses were lost: the data to which models of the probability of loss are fitted.
+class _Losses:
+    """Losses of m laser pulses, to which models of their probability are fitted.
 
-    Attributes
-    ----------
-    lost : (m,) whether each pulse was lost.
-    fit : (m,) true for pulses that are used for fitting.
-    log_likelihood : log-likelihood of the pulses in `fit` with one probability of loss for all, with which models are compared.
+    lost: (m,) whether each pulse was lost; fit: (m,) true for pulses that are used for fitting.
     """
 
     lost: BoolArray
     fit: BoolArray
-    log_likelihood: float
 
-    @classmethod
-    def of(cls, lost: BoolArray, fit: BoolArray) -> LossData:
-        """Prepare losses of laser pulses for fits: compute their log-likelihood with one probability of loss for all.
+    @cached_property
+    def log_likelihood(self) -> float:
+        """Log-likelihood with one probability for all pulses, with which models are compared."""
+        lost = self.lost[self.fit]
+        return bernoulli_log_likelihood(lost, np.full(len(lost), lost.mean()))
 
-        Parameters
-        ----------
-        lost : (m,) whether each pulse was lost.
-        fit : (m,) true for pulses to use for fitting.
-        """
-        share = np.full(int(fit.sum()), np.clip(lost[fit].mean(), 1e-9, 1 - 1e-9))
-        return cls(lost, fit, _log_likelihood(lost[fit], share))
-
-    def best(
+    def fitted(
         self, probability: Callable[[FloatArray, FloatArray], FloatArray], x: FloatArray, starts: list[FloatArray]
-    ) -> _LossFit:
-        """Fit a model of the probability that a laser pulse is lost, by maximum likelihood.
+    ) -> tuple[FloatArray, Callable[[FloatArray], float]]:
+        """Fit a model of the probability of a loss by maximum likelihood.
 
         Parameters
         ----------
-        probability : function of the model's parameters (an array) and of covariate values, which returns the probability of
-            loss for each value.
+        probability : function of the model's parameters and of covariate values, which returns the probability for each value.
         x : (m,) covariate of each pulse, such as its range.
         starts : parameter vectors; the search begins at the most likely one.
 
         Returns
         -------
-        _LossFit : best parameters, log-likelihood ratio against one probability for all pulses, and probabilities (m,).
+        tuple : the parameters, and the negative log-likelihood as a function of parameters.
         """
         seen, lost = x[self.fit], self.lost[self.fit]
         every = slice(None, None, max(len(lost) // _MOST_PULSES, 1))
-        first = starts[int(np.argmax([_log_likelihood(lost[every], probability(start, seen[every])) for start in starts]))]
+        first = max(starts, key=lambda start: bernoulli_log_likelihood(lost[every], probability(start, seen[every])))
 
         def cost(values: FloatArray) -> float:
-            return -_log_likelihood(lost, probability(values, seen))
+            return -bernoulli_log_likelihood(lost, probability(values, seen))
 
-        found = minimize(cost, first, method="Nelder-Mead", options={"maxiter": 150, "xatol": 1e-3, "fatol": 0.05})
-        return _LossFit(found.x, -float(found.fun) - self.log_likelihood, probability(found.x, x), cost)
-
-
-@dataclass(frozen=True)
-class _LossFit:
-    """Result of a fit.
-
-    values: parameters at the maximum; gain: log-likelihood ratio; probability: (m,); cost: negative log-likelihood of
-    parameters.
-    """
-
-    values: FloatArray
-    gain: float
-    probability: FloatArray
-    cost: Callable[[FloatArray], float]
+        options = {"maxiter": 150, "xatol": 1e-3, "fatol": 0.05}
+        return minimize(cost, first, method="Nelder-Mead", options=options).x, cost
 
 
 def explain_missing_returns(
@@ -145,26 +118,21 @@ def explain_missing_returns(
     points : number of returns among which `early` were counted.
     intensity : (n,) recorded powers of the returns, to find a detection limit; None if not recorded.
     """
-    lost = missing.lost
-    losses = LossData.of(lost, fit)
+    losses = _Losses(missing.lost, fit)
     limit = _fit_detection_limit(losses, missing.covariates["log_power"])
-    precipitation = _fit_precipitation(losses, missing.covariates["range"], early, points)
     if intensity is not None and not _ends_abruptly(intensity):
         limit = replace(limit, score=-np.inf)
-    best, second = (limit, precipitation) if limit.score >= precipitation.score else (precipitation, limit)
+    precipitation = _fit_precipitation(losses, missing.covariates["range"], early, points)
+    best = max((limit, precipitation), key=lambda each: each.score)
     free = _fit_directional_losses(losses, missing.covariates)
     ahead = free.score - max(best.score, 0.0)
     if ahead > thresholds().variance.least_gain and _strips_agree(missing, best, free, fit):
         best = free
-    confidence = 1 / _overdispersion(lost[fit], best.probability[fit], missing.wall_xy[fit])
-    best = replace(best, gain=best.gain * confidence, score=best.score * confidence)
-    if best.score < thresholds().variance.least_gain:
+    confidence = 1 / _overdispersion(missing.lost[fit], best.probability[fit], missing.wall_xy[fit])
+    if best.score * confidence < thresholds().variance.least_gain:
         return None
-    return replace(
-        best,
-        std={key: value / np.sqrt(confidence) for key, value in best.std.items()},
-        tried=((best.name, best.score), (second.name, second.score)),
-    )
+    std = {key: value / np.sqrt(confidence) for key, value in best.std.items()}
+    return replace(best, gain=best.gain * confidence, score=best.score * confidence, std=std)
 
 
 def count_isolated_returns(at: FloatArray, early: BoolArray) -> int:
@@ -197,17 +165,12 @@ def _strips_agree(missing: ExpectedPulses, known: LossExplanation, free: LossExp
     A shrub before the wall takes pulses in a few strips only, and so do lines that the scanner dropped.
     """
     lost, across = missing.lost[fit], missing.covariates[_DIRECTIONS[free.covariate]][fit]
-    strip, group = _quantile_group(across, _STRIPS), _quantile_group(missing.covariates[free.covariate], _BINS)[fit]
+    strip, group = quantile_group(across, _STRIPS), quantile_group(missing.covariates[free.covariate], _BINS)[fit]
     sent, gone = (np.bincount(strip * _BINS + group, each, _STRIPS * _BINS).reshape(_STRIPS, _BINS) for each in (None, lost))
     others = (gone.sum(axis=0) - gone + 0.5) / (sent.sum(axis=0) - sent + 1.0)
     p, q = np.clip(known.probability[fit], 1e-9, 1 - 1e-9), others[strip, group]
     sums = np.bincount(strip, np.where(lost, np.log(q / p), np.log1p(-q) - np.log1p(-p)), _STRIPS)
-    return float(sums.sum()) > thresholds().missing_returns.least_agreement * np.sqrt(_STRIPS) * float(np.linalg.norm(sums))
-
-
-def _quantile_group(values: FloatArray, count: int) -> NDArray[np.int64]:
-    """(m,) group of each value, of `count` groups of equal size."""
-    return np.asarray(np.searchsorted(np.quantile(values, np.linspace(0, 1, count + 1)[1:-1]), values))
+    return agreement(sums) > thresholds().missing_returns.least_agreement * np.sqrt(_STRIPS)
 
 
 def _ends_abruptly(intensity: FloatArray) -> bool:
@@ -221,7 +184,7 @@ def _ends_abruptly(intensity: FloatArray) -> bool:
     return (middle - low) < thresholds().missing_returns.cutoff_ratio * (high - low)
 
 
-def _fit_detection_limit(losses: LossData, log_power: FloatArray) -> LossExplanation:
+def _fit_detection_limit(losses: _Losses, log_power: FloatArray) -> LossExplanation:
     """P = p0 + (1 - p0) Phi((ln P_min - ln rho - ln(cos i / R^2)) / s), for an unknown, log-normal albedo rho."""
 
     def probability(values: FloatArray, x: FloatArray) -> FloatArray:
@@ -234,29 +197,27 @@ def _fit_detection_limit(losses: LossData, log_power: FloatArray) -> LossExplana
         for level in np.quantile(log_power, [0.0, 0.02, 0.05, 0.1, 0.2, 0.35, 0.5, 0.65, 0.8, 0.95])
         for base in (0.003, 0.02, 0.08)
     ]
-    found = losses.best(probability, log_power, starts)
-    value = float(np.exp(np.clip(found.values[0], -_LARGEST_LOG_POWER, _LARGEST_LOG_POWER)) * 0.5)
-    std = {"minimum_power": value * float(np.exp(found.values[1]))}
-    return LossExplanation(DetectionLimit.tag(), found.gain, found.gain - 3.0, {"minimum_power": value}, std, found.probability)
+    best, cost = losses.fitted(probability, log_power, starts)
+    gain = -cost(best) - losses.log_likelihood
+    value = float(np.exp(np.clip(best[0], -_LARGEST_LOG_POWER, _LARGEST_LOG_POWER)) * 0.5)
+    parameters, std = {"minimum_power": value}, {"minimum_power": value * float(np.exp(best[1]))}
+    return LossExplanation(DetectionLimit.tag(), gain, gain - 3.0, parameters, std, probability(best, log_power))
 
 
-def _fit_precipitation(losses: LossData, range_m: FloatArray, early: int, points: int) -> LossExplanation:
+def _fit_precipitation(losses: _Losses, range_m: FloatArray, early: int, points: int) -> LossExplanation:
     """P = 1 - (1 - p0) exp(-2 beta R). Early returns count as drops if there are more than a few."""
 
     def probability(values: FloatArray, x: FloatArray) -> FloatArray:
         return np.asarray(1 - (1 - expit(values[1])) * np.exp(-2 * np.exp(values[0]) * x))
 
     starts = [np.array([np.log(rate), logit(base)]) for rate in np.geomspace(1e-6, 0.05, 20) for base in (0.003, 0.01, 0.03, 0.1)]
-    found = losses.best(probability, range_m, starts)
+    best, cost = losses.fitted(probability, range_m, starts)
     share = min(early / max(float(losses.lost.sum()) + early, 1.0), 1.0)
-    rate = max(float(np.exp(found.values[0])) / max(1 - share, 1e-3), 1e-6)
+    rate = max(float(np.exp(best[0])) / max(1 - share, 1e-3), 1e-6)
     drops = 10.0 * early if early > max(5, 1e-4 * points) else 0.0
-    std = {
-        "rate_per_m": rate * _first_parameter_std(found.cost, found.values),
-        "early_share": float(np.sqrt(share / max(early, 1))),
-    }
-    gain, parameters = found.gain + drops, {"rate_per_m": rate, "early_share": share}
-    return LossExplanation(Precipitation.tag(), gain, gain - 2.0, parameters, std, found.probability)
+    std = {"rate_per_m": rate * _first_parameter_std(cost, best), "early_share": float(np.sqrt(share / max(early, 1)))}
+    gain, parameters = -cost(best) - losses.log_likelihood + drops, {"rate_per_m": rate, "early_share": share}
+    return LossExplanation(Precipitation.tag(), gain, gain - 2.0, parameters, std, probability(best, range_m))
 
 
 def _first_parameter_std(cost: Callable[[FloatArray], float], top: FloatArray) -> float:
@@ -274,21 +235,21 @@ def _first_parameter_std(cost: Callable[[FloatArray], float], top: FloatArray) -
     return float(np.sqrt(other / determinant)) if determinant > 0 < other else 1.0
 
 
-def _fit_directional_losses(losses: LossData, covariates: dict[str, FloatArray]) -> LossExplanation:
+def _fit_directional_losses(losses: _Losses, covariates: dict[str, FloatArray]) -> LossExplanation:
     """Losses free in each bin of one angle (non-parametric); their mean is given as a rate of precipitation."""
     found, lost, fit = [], losses.lost, losses.fit
     rate = max(-float(np.log1p(-min(float(lost.mean()), 0.999))) / (2 * float(np.mean(covariates["range"]))), 1e-6)
     for name in _DIRECTIONS:
-        group = _quantile_group(covariates[name], _BINS)
+        group = quantile_group(covariates[name], _BINS)
         count = np.maximum(np.bincount(group[fit], minlength=_BINS), 1)
         probability = (np.bincount(group[fit], lost[fit], _BINS) / count)[group]
-        gain = _log_likelihood(lost[fit], probability[fit]) - losses.log_likelihood
+        gain = bernoulli_log_likelihood(lost[fit], probability[fit]) - losses.log_likelihood
         parameters = {"rate_per_m": rate, "early_share": 0.0}
-        found.append(LossExplanation(Precipitation.tag(), gain, gain - _BINS, parameters, {}, probability, (), name))
+        found.append(LossExplanation(Precipitation.tag(), gain, gain - _BINS, parameters, {}, probability, name))
     return max(found, key=lambda each: each.score)
 
 
-def _log_likelihood(lost: BoolArray, probability: FloatArray) -> float:
-    """Bernoulli log-likelihood of losses (m,) with probability (m,)."""
+def bernoulli_log_likelihood(happened: BoolArray, probability: FloatArray) -> float:
+    """Return the log-likelihood of independent events (m,), such as losses of pulses, that happen with probability (m,)."""
     p = np.clip(probability, 1e-9, 1 - 1e-9)
-    return float(np.sum(np.log(np.where(lost, p, 1 - p))))
+    return float(np.sum(np.log(np.where(happened, p, 1 - p))))

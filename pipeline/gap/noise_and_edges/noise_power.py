@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 from pipeline.change.robust import nmad
 from pipeline.gap.mean.detection_power import DetectableSize
 from pipeline.gap.noise_and_edges.sign_flips import null_critical_score
-from pipeline.gap.noise_and_edges.variance_fit import VarianceCandidate
 from pipeline.gap.noise_and_edges.variance_model import standardised_deviations, variance_candidates
 from pipeline.gap.residuals.residuals import Residuals
 from pipeline.gap.residuals.wall_blocks import WallCells
@@ -29,14 +28,9 @@ def detectable_noise(
 ) -> list[DetectableSize]:
     """Compute from which size on noise terms would have been found in a measurement with a probability of 95 %.
 
-    Noise terms are fitted to deviations from a plane within small squares of the wall. Noise that neighbouring points share
-    hardly shows there, and is left out.
-
     Parameters
     ----------
-    residuals : Residuals of n points with their predicted standard deviations.
-    cells : The small squares of the wall.
-    value : (n,) residuals after the systematic effects are removed, m (ranges) or px (disparities).
+    residuals, cells, value : arguments of `fit_variance_model`, which would have found them.
     named : Names of effects that were found, which are not listed.
     random : Source of random numbers, for the null distribution of the test statistic.
 
@@ -60,16 +54,11 @@ def detectable_noise(
     for candidate, shape in zip(candidates, shapes, strict=True):
         if candidate.name in named:
             continue
-        item = _detectable(candidate, _least_variance(squares, shape, block, critical, missing))
+        name, size = candidate.main_parameter(_least_variance(squares, shape, block, critical, missing))
+        item = DetectableSize(candidate.name, name, size, dict(candidate.fixed))
         if candidate.name not in found or item.size < found[candidate.name].size:
             found[candidate.name] = item
     return list(found.values())
-
-
-def _detectable(candidate: VarianceCandidate, theta: float) -> DetectableSize:
-    """The detectable size of a noise term from its detectable variance, in units of that at its typical sizes."""
-    value = candidate.parameters(np.full(len(candidate.names), theta))[candidate.names[0]] if np.isfinite(theta) else np.inf
-    return DetectableSize(candidate.name, candidate.names[0], value, dict(candidate.fixed))
 
 
 def _least_variance(squares: FloatArray, shape: FloatArray, block: NDArray[np.int64], critical: float, missing: float) -> float:

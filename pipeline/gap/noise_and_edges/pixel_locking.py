@@ -103,31 +103,6 @@ class NoiseBounds:
     predicted: float
     measured: float
 
-    def in_matched_pixels(self, frequency: float) -> NoiseBounds:
-        """Convert the bounds of the noise to pixels of the image that was matched, which may be reduced.
-
-        frequency: number of matched pixels per px of the full image, at most about 1.
-        """
-        return NoiseBounds(self.predicted * frequency, self.measured * frequency)
-
-    def noise_range(self, amplitude: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return the lowest and highest plausible standard deviation of matching noise for trial amplitudes of pixel locking.
-
-        The measured variance contains noise and locking, so a larger amplitude leaves less for the noise.
-
-        Parameters
-        ----------
-        amplitude : (k,) trial amplitudes of the locking, same unit as the bounds.
-
-        Returns
-        -------
-        tuple : (k,) lowest and (k,) highest standard deviations.
-        """
-        left = np.sqrt(np.maximum(self.measured**2 - amplitude**2 / 2, _LEAST_NOISE_SHARE * self.measured**2))
-        return (1 - _NOISE_UNCERTAINTY) * np.minimum(left, self.predicted), (1 + _NOISE_UNCERTAINTY) * np.maximum(
-            left, self.predicted
-        )
-
 
 def find_locking(
     disparity: FloatArray,
@@ -172,15 +147,15 @@ def find_locking(
         return None
     frequency, turned = best.frequency, 1 + np.tan(best.tilt) * rows
     pixels = frequency * (disparities / turned + far)
-    strength = np.array([abs(np.exp(2j * np.pi * k * pixels).mean()) for k in _MULTIPLES])
-    allowed, sine = None if noise is None else noise.in_matched_pixels(frequency), None
+    phasors = [np.exp(2j * np.pi * k * pixels).mean() for k in _MULTIPLES]
+    allowed = None if noise is None else NoiseBounds(noise.predicted * frequency, noise.measured * frequency)
+    sine = None
     if noise is not None and residual is not None:
         left = residual[every]
         clipped = np.clip(left - np.median(left), -_CLIP * noise.measured, _CLIP * noise.measured)
         sine = _sine_of_residuals(frequency * clipped, pixels - frequency * left / turned, frequency * reach)
-    share, error = _amplitude(strength, count, allowed, sine)
-    first = complex(np.exp(2j * np.pi * pixels).mean())
-    phase = float(np.angle(-np.conj(first) * np.sign(j1(2 * np.pi * share))))
+    share, error = _amplitude(np.array([abs(each) for each in phasors]), count, allowed, sine)
+    phase = float(np.angle(-np.conj(phasors[0]) * np.sign(j1(2 * np.pi * share))))
     return Locking(share / frequency, error / frequency, 1 / frequency, phase, best.tilt, float(gain))
 
 
@@ -306,8 +281,11 @@ def _amplitude(
     """
 
     def misfit_of_noise(share: FloatArray, blur: FloatArray, noise: NoiseBounds) -> FloatArray:
-        least, most = (each[:, None] for each in noise.noise_range(share))
-        unit = _NOISE_UNCERTAINTY * noise.predicted
+        # the measured variance contains noise and locking, so a larger amplitude leaves less for the noise
+        variance = np.maximum(noise.measured**2 - share**2 / 2, _LEAST_NOISE_SHARE * noise.measured**2)
+        left, unit = np.sqrt(variance)[:, None], _NOISE_UNCERTAINTY * noise.predicted
+        least = (1 - _NOISE_UNCERTAINTY) * np.minimum(left, noise.predicted)
+        most = (1 + _NOISE_UNCERTAINTY) * np.maximum(left, noise.predicted)
         if sine is None:
             return np.asarray((np.maximum(least - blur, 0) + np.maximum(blur - most, 0)) ** 2 / unit**2)
         lowest, highest = (

@@ -20,8 +20,7 @@ class RangeStep:
 
     Attributes
     ----------
-    step_m : the step, m.
-    std_m : its standard deviation, which follows from the resolution of the search, m.
+    step_m, std_m : the step and its standard deviation, which follows from the resolution of the search, m.
     strength : mean resultant length of the ranges modulo the step: 1 if all are exact multiples, 0 if none are rounded.
     """
 

@@ -38,16 +38,8 @@ def null_p_value(squares: FloatArray, shapes: list[FloatArray], block: NDArray[n
 def null_critical_score(squares: FloatArray, shapes: list[FloatArray], block: NDArray[np.int64], random: KeyedRandom) -> float:
     """Return the critical value of the test of `null_p_value`, to compute how large a noise effect must be to be found.
 
-    The test asks whether any candidate noise effect explains that residuals vary more than predicted. Its statistic is the
-    largest standardised score over the candidates. The null distribution comes from random sign flips of the scores of whole
-    wall blocks (squares of the wall). The critical value is its quantile at the significance level `mean.significance`.
-
-    Parameters
-    ----------
-    squares : (n,) squared deviations of the residuals, over their predicted variance.
-    shapes : for each candidate effect the (n,) variance that it adds at each point, divided by the predicted one.
-    block : (n,) number of each point's wall block.
-    random : source of random numbers.
+    It is the quantile of the null distribution at the significance level `mean.significance`. The arguments are those of
+    `null_p_value`.
     """
     _, largest = _scores_with_flipped_signs(squares, shapes, block, random)
     return float(np.quantile(largest, 1 - thresholds().mean.significance))

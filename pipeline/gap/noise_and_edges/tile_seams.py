@@ -8,6 +8,7 @@ differences across seams larger than elsewhere.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -42,9 +43,7 @@ side, which moves the last seam by half a cell."""
 
 @dataclass(frozen=True)
 class TileSeams:
-    """Square image tiles that were found in disparities: a stereo matcher processed them separately and shifted them.
-
-    Neighbouring tiles are shifted in opposite directions, so their disparities differ by twice the amplitude.
+    """Square image tiles that a stereo matcher processed separately and shifted, neighbours in opposite directions.
 
     Attributes
     ----------
@@ -64,45 +63,79 @@ class TileSeams:
 
 @dataclass(frozen=True)
 class _SeamDifferences:
-    """Differences of neighbouring cells along one axis, 0 where one is missing.
+    """Differences of neighbouring cells along one axis of a raster, clipped; 0 where one is missing.
 
     Attributes
     ----------
-    value, known : (rows, columns) clipped differences, and where both cells hold a point.
+    along, beside : (c,) and (r,) coordinates of the cells along the axis and across it, px.
+    value, known : (r, c - 1) differences, and where both cells hold a point.
     """
 
+    along: FloatArray
+    beside: FloatArray
     value: FloatArray
     known: BoolArray
 
     @classmethod
-    def of(cls, raster: FloatArray, axis: int) -> _SeamDifferences:
-        """Compute them from a raster (rows, columns), NaN where there is no point."""
-        found = np.diff(raster, axis=axis)
+    def of(cls, along: FloatArray, beside: FloatArray, raster: FloatArray) -> _SeamDifferences:
+        """Compute them from a raster (r, c), NaN where there is no point."""
+        found = np.diff(raster, axis=1)
         known = ~np.isnan(found)
         most = _CLIP_SIGMAS * nmad(found[known]) if known.any() else 0.0
-        return cls(np.where(known, np.clip(found, -most, most), 0.0), known)
+        return cls(along, beside, np.where(known, np.clip(found, -most, most), 0.0), known)
 
     @property
     def variance(self) -> float:
         """Variance of the differences."""
         return float(np.sum(self.value**2) / max(self.known.sum(), 1))
 
+    @cached_property
+    def _cumulative(self) -> list[FloatArray]:
+        """Sums (r + 1, c - 1) of the differences of the first rows of cells, px, and the numbers of those that are known."""
+        sums = (np.cumsum(each, axis=0, dtype=np.float64) for each in (self.value, self.known))
+        return [np.pad(each, ((1, 0), (0, 0))) for each in sums]
+
+    def jumps(self, side: float) -> tuple[FloatArray, FloatArray, NDArray[np.int64]]:
+        """Sums of the differences over each row of tiles (t, c - 1), their numbers, and the numbers of the seams.
+
+        side: side of a tile, px.
+        """
+        edges = np.flatnonzero(np.diff(np.floor(self.beside / side))) + 1
+        rows = np.concatenate([[0], edges, [len(self.beside)]])
+        sums, counts = (np.diff(each[rows], axis=0) for each in self._cumulative)
+        return sums, counts, np.flatnonzero(np.diff(np.floor(self.along / side)))
+
+    def seam_scores(self, side: float) -> FloatArray:
+        """Normal score of each seam: from the rank of its mean squared jump among those of all neighbouring columns."""
+        sums, counts, seams = self.jumps(side)
+        square = np.divide(sums**2, counts, out=np.zeros_like(sums), where=counts > 0).sum(axis=0)
+        rows = (counts > 0).sum(axis=0)
+        known = rows > 0
+        rank = np.zeros(len(rows))
+        rank[known] = rankdata(square[known] / rows[known])
+        return ndtri((rank[seams][known[seams]] - 0.5) / known.sum())
+
+    def squared_jumps(self, side: float) -> FloatArray:
+        """Squares of the jumps at the seams, px², each minus what noise contributes to it."""
+        sums, counts, seams = self.jumps(side)
+        at_seam = np.zeros(sums.shape[1], dtype=bool)
+        at_seam[seams] = True
+        known, many = counts > 0, np.maximum(counts, 1)
+        noise = float(np.mean((sums**2 / many)[known & ~at_seam]))
+        return np.asarray(((sums**2 / many - noise) / many)[known & at_seam])
+
 
 @dataclass(frozen=True)
 class _SeamTest:
-    """Input of the test for shifted tiles: differences of neighbouring cells of a raster, and the sides of a tile to try.
+    """Input of the test for shifted tiles.
 
     Attributes
     ----------
-    u, v : (columns,) and (rows,) coordinates of the raster's columns and rows, px.
-    across, down : differences along rows and along columns.
-    sides : (k,) sides of a tile, px.
+    axes : differences of neighbouring cells of a raster, along its rows and along its columns.
+    sides : (k,) sides of a tile to try, px.
     """
 
-    u: FloatArray
-    v: FloatArray
-    across: _SeamDifferences
-    down: _SeamDifferences
+    axes: tuple[_SeamDifferences, _SeamDifferences]
     sides: FloatArray
 
     @classmethod
@@ -115,12 +148,19 @@ class _SeamTest:
         (u, column), (v, row) = (_axis(x, step) for x in (at.u, at.v))
         raster = np.full((len(v), len(u)), np.nan)
         raster[row, column] = registered_residuals
-        found = cls(u, v, _SeamDifferences.of(raster, 1), _SeamDifferences.of(raster, 0), _sides(u, v, step))
-        return found if len(found.sides) and found.across.variance and found.down.variance else None
+        axes = _SeamDifferences.of(u, v, raster), _SeamDifferences.of(v, u, raster.T)
+        sides = _sides(float(max(u[-1], v[-1])), step)
+        return cls(axes, sides) if len(sides) and all(each.variance for each in axes) else None
 
-    def trials(self, sides: FloatArray) -> _TileTrials:
-        """Evaluate sides of a tile (k,), px."""
-        return _TileTrials.of(sides, self.u, self.v, self.across, self.down)
+    def trials(self, sides: FloatArray) -> FloatArray:
+        """(2, k) weighted sum of the signed differences across seams, and information on the amplitude, for sides (k,), px."""
+        signs = [1.0 - 2.0 * (np.floor(each.along[None] / sides[:, None]) % 2) for each in self.axes]
+        total, information = np.zeros(len(sides)), np.zeros(len(sides))
+        for axis, along, beside in zip(self.axes, signs, reversed(signs), strict=True):
+            jump = np.diff(along, axis=1)
+            total += np.sum((beside @ axis.value) * jump, axis=1) / axis.variance
+            information += jump**2 @ axis.known.sum(axis=0) / axis.variance
+        return np.stack([total, information])
 
 
 def find_tile_seams(residuals: StereoResiduals, registered_residuals: FloatArray) -> TileSeams | None:
@@ -143,25 +183,26 @@ def find_tile_seams(residuals: StereoResiduals, registered_residuals: FloatArray
     if test is None:
         return None
     sides = test.sides
-    trials = [test.trials(part) for part in np.array_split(sides, -(-len(sides) // _AT_ONCE))]
-    coarse = max(trials, key=lambda each: abs(each.sigmas[each.best]))
-    p_value = min(2 * len(sides) * float(norm.sf(abs(coarse.sigmas[coarse.best]))), 1.0)
+    parts = np.array_split(sides, -(-len(sides) // _AT_ONCE))
+    coarse, first = _most_significant(np.concatenate([test.trials(part) for part in parts], axis=1))
+    p_value = min(2 * len(sides) * float(norm.sf(abs(coarse[first]))), 1.0)
     if p_value > thresholds().locking.significance:
         return None
     reach = 2 * float(sides[1] / sides[0] - 1)
-    found = test.trials(coarse.sides[coarse.best] * np.linspace(1 - reach, 1 + reach, _REFINED))
-    sigmas, information = float(found.sigmas[found.best]), float(found.information[found.best])
-    near = found.sides[np.abs(found.sigmas) > abs(sigmas) - 1]
-    amplitude, unequal = float(found.total[found.best]) / information, find_unequal_tiles(residuals, registered_residuals)
+    finer = sides[first] * np.linspace(1 - reach, 1 + reach, _REFINED)
+    trials = test.trials(finer)
+    sigmas, best = _most_significant(trials)
+    near, (total, information) = finer[np.abs(sigmas) > abs(sigmas[best]) - 1], map(float, trials[:, best])
+    amplitude, unequal = total / information, find_unequal_tiles(residuals, registered_residuals)
     if unequal is not None and (2 * amplitude) ** 2 < _LEAST_PATTERN_SHARE * unequal.jump_px**2:
         return None
     return TileSeams(
-        float(near.mean()),
-        amplitude,
-        float(np.ptp(near) + np.diff(found.sides)[0]) / np.sqrt(12),
-        float(1 / np.sqrt(information)),
-        0.5 * sigmas**2,
-        p_value,
+        tile_px=float(near.mean()),
+        amplitude_px=amplitude,
+        tile_std_px=float(np.ptp(near) + finer[1] - finer[0]) / np.sqrt(12),
+        amplitude_std_px=float(1 / np.sqrt(information)),
+        gain=0.5 * float(sigmas[best]) ** 2,
+        p_value=p_value,
     )
 
 
@@ -169,7 +210,7 @@ def find_tile_seams(residuals: StereoResiduals, registered_residuals: FloatArray
 class UnequalTiles:
     """Square image tiles whose disparities jump at their seams by amounts that follow no pattern.
 
-    The catalogue has no effect for them: a matcher that processes tiles separately may shift each by another amount.
+    The catalogue has no effect for them.
 
     Attributes
     ----------
@@ -194,11 +235,10 @@ class UnequalTiles:
 def find_unequal_tiles(residuals: StereoResiduals, value: FloatArray) -> UnequalTiles | None:
     """Find image tiles that a stereo matcher shifted by unequal amounts, against each other.
 
-    Between each two neighbouring columns of the raster, each row of tiles has a mean difference, its jump. The square of each
-    jump, times the number of its differences, is averaged; without tiles it has the same expectation in every column. If tiles
-    are shifted, the columns at their seams rank high among all columns, and so do rows. The normal scores of the ranks (van der
-    Waerden) are summed over the seams. A single edge on the wall therefore counts little. Both axes must have seams that rank
-    high, because locked or rounded disparities jump along one axis only.
+    Between two neighbouring columns of the raster, each row of tiles has a mean difference, its jump. The mean of the squared
+    jumps, times the numbers of their differences, ranks high among all columns where tiles have a seam. The normal scores of
+    the ranks (van der Waerden) are summed over the seams, so that a single edge on the wall counts little. Rows must rank high
+    too, because locked or rounded disparities jump along one axis only.
 
     Parameters
     ----------
@@ -212,16 +252,12 @@ def find_unequal_tiles(residuals: StereoResiduals, value: FloatArray) -> Unequal
     test = _SeamTest.of(residuals, value)
     if test is None:
         return None
-    axes = (
-        _AxisJumps.of(test.u, test.v, test.across.value, test.across.known),
-        _AxisJumps.of(test.v, test.u, test.down.value.T, test.down.known.T),
-    )
     sides = test.sides[::_SIDE_STRIDE]
-    scores = np.array([_seam_score(axes, side) for side in sides])
+    scores = np.array([_seam_score(test.axes, side) for side in sides])
     side, p_value = float(sides[np.argmax(scores)]), float(len(scores) * norm.sf(scores.max()))
     if p_value > thresholds().locking.significance:
         return None
-    jumps = np.concatenate([each.squared_jumps(side) for each in axes])
+    jumps = np.concatenate([each.squared_jumps(side) for each in test.axes])
     return UnequalTiles(side, float(np.sqrt(max(float(jumps.mean()), 0.0))), p_value)
 
 
@@ -246,106 +282,18 @@ def detectable_tile_shift(residuals: StereoResiduals, registered_residuals: Floa
         )
     side = test.sides[len(test.sides) // 2]
     needed = float(norm.isf(thresholds().locking.significance / (2 * len(test.sides)))) + float(norm.ppf(POWER))
-    size = needed / float(np.sqrt(test.trials(np.array([side])).information[0]))
+    size = needed / float(np.sqrt(test.trials(np.array([side]))[1, 0]))
     return DetectableSize(name, "amplitude_px", size, {"tile_px": float(side)})
 
 
-@dataclass(frozen=True)
-class _TileTrials:
-    """Sides of a tile that were tried.
-
-    Attributes
-    ----------
-    sides : (k,) sides, px.
-    total, information : (k,) weighted sum of the signed differences across seams, and the information on the amplitude.
-    """
-
-    sides: FloatArray
-    total: FloatArray
-    information: FloatArray
-
-    @classmethod
-    def of(cls, sides: FloatArray, u: FloatArray, v: FloatArray, across: _SeamDifferences, down: _SeamDifferences) -> _TileTrials:
-        """Evaluate sides (k,) with the differences along rows and columns of a raster with coordinates u and v, px."""
-        column, row = (1.0 - 2.0 * (np.floor(x[None] / sides[:, None]) % 2) for x in (u, v))
-        total, information = np.zeros(len(sides)), np.zeros(len(sides))
-        for along, beside, value, known, variance in (
-            (column, row, across.value, across.known, across.variance),
-            (row, column, down.value.T, down.known.T, down.variance),
-        ):
-            jump = np.diff(along, axis=1)
-            total += np.sum((beside @ value) * jump, axis=1) / variance
-            information += jump**2 @ known.sum(axis=0) / variance
-        return cls(sides, total, information)
-
-    @property
-    def sigmas(self) -> FloatArray:
-        """(k,) amplitudes over their standard deviations."""
-        return np.divide(self.total, np.sqrt(self.information), out=np.zeros_like(self.total), where=self.information > 0)
-
-    @property
-    def best(self) -> int:
-        """Number of the side with the most significant amplitude."""
-        return int(np.argmax(np.abs(self.sigmas)))
+def _most_significant(trials: FloatArray) -> tuple[FloatArray, int]:
+    """(k,) amplitudes of trials (2, k) over their standard deviations, and the number of the largest."""
+    total, information = trials
+    sigmas = np.divide(total, np.sqrt(information), out=np.zeros_like(total), where=information > 0)
+    return sigmas, int(np.argmax(np.abs(sigmas)))
 
 
-@dataclass(frozen=True)
-class _AxisJumps:
-    """Sums of the differences of neighbouring cells along one axis of the raster, for the jumps between whole tiles.
-
-    Attributes
-    ----------
-    along : (c,) coordinates of the cells along the axis, px.
-    beside : (r,) coordinates of the cells across the axis, px.
-    sums : (r + 1, c - 1) cumulative sums across the axis: row k is the sum of the differences of the first k rows of cells, px.
-    counts : (r + 1, c - 1) the same for the numbers of known differences.
-    """
-
-    along: FloatArray
-    beside: FloatArray
-    sums: FloatArray
-    counts: FloatArray
-
-    @classmethod
-    def of(cls, along: FloatArray, beside: FloatArray, value: FloatArray, known: BoolArray) -> _AxisJumps:
-        """Sum the differences (r, c - 1), which are 0 where one is not known."""
-        sums, counts = (np.pad(np.cumsum(each, axis=0, dtype=np.float64), ((1, 0), (0, 0))) for each in (value, known))
-        return cls(along, beside, sums, counts)
-
-    def jumps(self, side: float) -> tuple[FloatArray, FloatArray, NDArray[np.int64]]:
-        """Sums of the differences over each row of tiles (t, c - 1), their numbers, and the numbers of the seams.
-
-        side: side of a tile, px.
-        """
-        edges = np.flatnonzero(np.diff(np.floor(self.beside / side))) + 1
-        rows = np.concatenate([[0], edges, [len(self.beside)]])
-        return (
-            np.diff(self.sums[rows], axis=0),
-            np.diff(self.counts[rows], axis=0),
-            np.flatnonzero(np.diff(np.floor(self.along / side))),
-        )
-
-    def seam_scores(self, side: float) -> FloatArray:
-        """Normal score of each seam: from the rank of its mean squared jump among those of all neighbouring columns."""
-        sums, counts, seams = self.jumps(side)
-        square = np.divide(sums**2, counts, out=np.zeros_like(sums), where=counts > 0).sum(axis=0)
-        rows = (counts > 0).sum(axis=0)
-        known = rows > 0
-        rank = np.zeros(len(rows))
-        rank[known] = rankdata(square[known] / rows[known])
-        return ndtri((rank[seams][known[seams]] - 0.5) / known.sum())
-
-    def squared_jumps(self, side: float) -> FloatArray:
-        """Squares of the jumps at the seams, px², each minus what noise contributes to it."""
-        sums, counts, seams = self.jumps(side)
-        at_seam = np.zeros(sums.shape[1], dtype=bool)
-        at_seam[seams] = True
-        known, many = counts > 0, np.maximum(counts, 1)
-        noise = float(np.mean((sums**2 / many)[known & ~at_seam]))
-        return np.asarray(((sums**2 / many - noise) / many)[known & at_seam])
-
-
-def _seam_score(axes: tuple[_AxisJumps, _AxisJumps], side: float) -> float:
+def _seam_score(axes: tuple[_SeamDifferences, _SeamDifferences], side: float) -> float:
     """Sum of the normal scores of all seams, standardised; 0 if there are too few, or if those of one axis do not rank high."""
     of_axes = [each.seam_scores(side) for each in axes]
     scores = np.concatenate(of_axes)
@@ -360,9 +308,8 @@ def _axis(x: FloatArray, step: float) -> tuple[FloatArray, NDArray[np.int64]]:
     return low + step * np.arange(index.max() + 1), index
 
 
-def _sides(u: FloatArray, v: FloatArray, step: float) -> FloatArray:
+def _sides(last: float, step: float) -> FloatArray:
     """Sides of a tile to try, px. The last seam, at about `last`, moves by a part of a cell from one to the next."""
-    last = float(max(u[-1], v[-1]))
     smallest, largest = _SMALLEST_CELLS * step, _LARGEST_SHARE * last
     if largest <= smallest:
         return np.empty(0)

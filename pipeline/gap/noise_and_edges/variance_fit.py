@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,51 +27,50 @@ class VarianceCandidate:
     ----------
     name : name of the effect.
     variance : (n, k) variance that each parameter adds at its typical size, squared unit of the observable (m² or px²).
-    scale : (k,) typical sizes; the value of a parameter is scale * sqrt(theta).
-    names : (k,) names of the parameters.
-    cost : penalty subtracted from the log-likelihood ratio: the number of parameters, with those in `fixed`.
+    sizes : k typical sizes by the name of the parameter, the main one first; its value is its size times sqrt(theta).
     fixed : values, by name, of parameters that are not fitted; each of a few trial values makes a candidate of its own.
     """
 
     name: str
     variance: FloatArray
-    scale: tuple[float, ...]
-    names: tuple[str, ...]
-    cost: float = 1.0
-    fixed: Mapping[str, float] = field(default_factory=dict)
+    sizes: Mapping[str, float]
+    fixed: Mapping[str, float]
+
+    @property
+    def cost(self) -> float:
+        """Penalty subtracted from the log-likelihood ratio: the number of parameters, with those in `fixed`."""
+        return float(len(self.sizes) + len(self.fixed))
 
     def parameters(self, theta: FloatArray) -> dict[str, float]:
-        """Convert fitted factors of the variance to values of the noise effect's parameters, by name.
+        """Convert fitted factors theta (k,) of the variance to values of the noise effect's parameters, by name."""
+        return self._by_name(np.sqrt(theta)) | dict(self.fixed)
 
-        theta: (k,) factors; 1 is the variance at a parameter's typical size.
-        """
-        return dict(zip(self.names, map(float, np.sqrt(theta) * np.array(self.scale)), strict=True)) | dict(self.fixed)
+    def main_parameter(self, theta: float) -> tuple[str, float]:
+        """Return name and value of the noise effect's main parameter if theta is the same for all."""
+        name, size = next(iter(self.sizes.items()))
+        return name, float(np.sqrt(theta)) * size
 
     def standard_deviations(self, theta: FloatArray, error: FloatArray) -> dict[str, float]:
-        """Return the standard deviations of a noise effect's parameters by name.
+        """Return the standard deviations of a noise effect's parameters by name, from those (k,) of the factors theta (k,).
 
-        They follow from those of the fitted factors of the variance. If a factor is below its standard deviation, the parameter
-        may be 0; the returned value is then the size at which the factor equals its standard deviation.
-
-        Parameters
-        ----------
-        theta : (k,) fitted factors of the variance; 1 is the variance at a parameter's typical size.
-        error : (k,) standard deviations of theta.
+        If a factor is below its standard deviation, the parameter may be 0. Its value is then returned at which the factor equals
+        its standard deviation.
         """
-        root = np.sqrt(theta)
-        std = np.where(theta > error, error / np.maximum(2 * root, 1e-300), np.sqrt(error))
-        return dict(zip(self.names, map(float, std * np.array(self.scale)), strict=True))
+        return self._by_name(np.where(theta > error, error / np.maximum(2 * np.sqrt(theta), 1e-300), np.sqrt(error)))
+
+    def _by_name(self, relative: FloatArray) -> dict[str, float]:
+        """Values of the parameters from multiples (k,) of their typical sizes."""
+        return {name: float(each * size) for (name, size), each in zip(self.sizes.items(), relative, strict=True)}
 
 
 @dataclass(frozen=True)
 class VarianceFit:
-    """Some noise effects of a list, fitted together to squared deviations.
+    """Some noise effects of a list of candidates, fitted together to squared deviations.
 
     Attributes
     ----------
     members : places of the effects in the list.
-    theta, error : for each effect, the (k,) fitted factors of its variance and their standard deviations; a factor of 1 is the
-        variance at the typical size of the parameter.
+    theta, error : for each effect, the (k,) fitted factors of its variance (`VarianceCandidate`) and their standard deviations.
     gain : log-likelihood ratio of the models with and without the effects.
     score : gain minus the penalties of the effects.
     """
@@ -89,9 +88,9 @@ class VarianceFit:
         """Fit the variance 1 + sum theta f to squared deviations by Fisher scoring, with theta >= 0.
 
         squares : (n,) squared deviations of the residuals over their predicted variance.
-        shapes : for each noise effect of the list, the (n, k) variance f that its parameters add over the predicted one.
-        members : places in the list of the effects that are fitted.
-        candidates : the list of noise effects.
+        shapes : for each candidate, the (n, k) variance f that its parameters add over the predicted one.
+        members : places of the candidates that are fitted.
+        candidates : the list of candidates.
         """
         columns = np.concatenate([shapes[number] for number in members], axis=1)
         scale = 1 / np.maximum(columns.mean(axis=0), 1e-300)
@@ -111,13 +110,6 @@ class VarianceFit:
         ends = np.cumsum([shapes[number].shape[1] for number in members])[:-1]
         score = gain - sum(candidates[number].cost for number in members)
         return cls(tuple(members), tuple(np.split(theta * scale, ends)), tuple(np.split(error * scale, ends)), gain, score)
-
-    def replaces_only(self, chosen: VarianceFit, number: int) -> bool:
-        """Tell whether this fit replaces one effect of another fit and keeps all the others.
-
-        chosen : the other fit; number : place of the replaced effect in the list of noise effects.
-        """
-        return number not in self.members and set(chosen.members) - {number} <= set(self.members)
 
     def added(self, shapes: list[FloatArray]) -> FloatArray:
         """Return the (n,) variance that the effects add, over the predicted one. shapes: the argument of `fitted`."""
@@ -145,8 +137,8 @@ class BinnedVariance:
 def best_binned_variance(squares: FloatArray, covariates: Mapping[str, FloatArray]) -> BinnedVariance:
     """Return the covariate along which a variance free in each bin explains most.
 
-    If the tails are heavier than those of a normal distribution, the variances of bins differ more by chance, by a factor that
-    follows from the kurtosis. What the bins explain beside their common mean is divided by this factor.
+    Heavier tails than those of a normal distribution make the variances of bins differ more by chance. What the bins explain
+    beside their common mean is therefore divided by a factor that follows from the kurtosis.
 
     squares : (n,) squared deviations of the residuals over their predicted variance.
     covariates : (n,) values of each covariate, by name.
@@ -168,13 +160,18 @@ def _bins(covariates: Mapping[str, FloatArray]) -> Iterator[tuple[str, NDArray[n
     """Yield (n,) bin numbers: equally filled bins of each covariate; scan lines, image rows and columns, and cycles of them."""
     for name, values in covariates.items():
         if name not in ("edge_step", "line"):
-            yield name, np.searchsorted(np.quantile(values, np.linspace(0, 1, _BINS + 1)[1:-1]), values)
+            yield name, quantile_group(values, _BINS)
         if name in ("line", "image_x", "image_y"):
             lines, group = np.unique(np.round(values, _LINE_DIGITS), return_inverse=True)
             if 1 < len(lines) < len(values) / _FEWEST_IN_LINE:
                 yield name, group
                 number = np.rint((values - values.min()) / np.diff(lines).min()).astype(np.int64)
                 yield from ((name, number % cycle) for cycle in range(2, _LONGEST_CYCLE + 1))
+
+
+def quantile_group(values: FloatArray, count: int) -> NDArray[np.int64]:
+    """Return the group (n,) of each value, of `count` groups with equally many values."""
+    return np.asarray(np.searchsorted(np.quantile(values, np.linspace(0, 1, count + 1)[1:-1]), values))
 
 
 def _log_likelihood_gain(squares: FloatArray, added: FloatArray) -> float:

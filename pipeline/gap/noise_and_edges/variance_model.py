@@ -6,6 +6,7 @@ sigma_i^2 = predicted variance + sum_k theta_k f_k(i), theta_k >= 0, for candida
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 from itertools import combinations
 
 import numpy as np
@@ -14,9 +15,9 @@ from scipy.spatial import cKDTree
 
 from pipeline.change.robust import nmad
 from pipeline.gap.noise_and_edges.sign_flips import null_p_value
-from pipeline.gap.noise_and_edges.variance_fit import BinnedVariance, VarianceCandidate, VarianceFit, best_binned_variance
+from pipeline.gap.noise_and_edges.variance_fit import VarianceCandidate, VarianceFit, best_binned_variance
 from pipeline.gap.residuals.residuals import BoolArray, Geometry, Residuals
-from pipeline.gap.residuals.wall_blocks import WallCells
+from pipeline.gap.residuals.wall_blocks import WallCells, agreement
 from pipeline.gap.thresholds import equivalence_margin, thresholds
 from scene.common.keyed_random import KeyedRandom
 from scene.geometry.mesh import FloatArray
@@ -71,8 +72,7 @@ class VarianceScore:
     Attributes
     ----------
     name : name of the effect; for a variance fitted freely to a covariate (empirical term), that covariate.
-    gain : log-likelihood ratio of the models with and without the term.
-    score : gain minus the number of parameters.
+    gain, score : log-likelihood ratio of the models with and without the term, and the same minus the number of parameters.
     empirical : whether the term is not in the catalogue.
     """
 
@@ -130,9 +130,8 @@ def variance_candidates(residuals: Residuals) -> list[VarianceCandidate]:
     for effect in residuals.candidates:
         if effect.shows_in == ShowsIn.SPREAD and not effect.shared and effect.known(residuals.geometry):
             key, tried = effect.trials or ("", ())
-            found += [_candidate(effect, residuals.geometry, {key: value}) for value in tried] or [
-                _candidate(effect, residuals.geometry, {})
-            ]
+            fixed = [{key: value} for value in tried] or [{}]
+            found += [_candidate(effect, residuals.geometry, each) for each in fixed]
     return found
 
 
@@ -144,7 +143,7 @@ def _candidate(effect: type[Effect], geometry: Geometry, fixed: dict[str, float]
     sizes = effect.typical_sizes()
     columns = np.stack([effect(**fixed, **{key: size}).variance(geometry) for key, size in sizes.items()], axis=1)
     columns = np.minimum(columns, np.quantile(columns, _HIGHEST_QUANTILE, axis=0))
-    return VarianceCandidate(effect.tag(), columns, tuple(sizes.values()), tuple(sizes), len(sizes) + len(fixed), fixed)
+    return VarianceCandidate(effect.tag(), columns, sizes, fixed)
 
 
 def fit_variance_model(
@@ -168,7 +167,7 @@ def fit_variance_model(
     seen = _SquaredDeviations.of(residuals, cells, value, candidates, random) if candidates else None
     if seen is None:
         return [], [], ""
-    by = thresholds().variance
+    by, edges = thresholds().variance, thresholds().edges
     best, tried = seen.best, seen.scores()
     added = best.added(seen.shapes)
     p_value = null_p_value(seen.squares, [shape.sum(axis=1) for shape in seen.shapes], seen.block, random)
@@ -178,18 +177,19 @@ def fit_variance_model(
     unshared = _unshared_share(residuals, value, seen.used, added) if residuals.sensor == "tls" else 1.0
     if unshared < by.least_unshared_share:
         return [], tried, _describe_shared_variance(float(added.mean()), unshared, residuals.sigma)
-    pairs = seen.pairs()
-    pair = max(pairs, key=lambda fit: fit.score, default=best)
-    chosen = pair if seen.fits_better(pair, best) and all(float(theta.max()) > 0 for theta in pair.theta) else best
+    pair = seen.best_pair
+    added_by_pair = pair.added(seen.shapes)
+    better = seen.is_clearly_better(pair.score - best.score, added, added_by_pair, edges.block_sigmas)
+    chosen = pair if better and all(float(theta.max()) > 0 for theta in pair.theta) else best
+    added = added_by_pair if chosen is pair else added
     free = best_binned_variance(seen.squares, {name: each[seen.used] for name, each in residuals.covariates.items()})
     tried = sorted([*tried, VarianceScore(free.name, free.gain, free.score, True)], key=lambda item: -item.score)
-    if not seen.free_form_fits_better(free, chosen):
-        return seen.terms(chosen, pairs, p_value), tried, ""
-    if free.score - chosen.score > by.nonparametric_share * chosen.gain:
-        named = [replace(each, empirical=True) for each in seen.terms(best, pairs, p_value)]
-        return named, tried, f"the noise varies with {free.name}, which no effect of the catalogue explains"
-    note = f"the noise also varies with {free.name}, which no effect of the catalogue explains"
-    return seen.terms(chosen, pairs, p_value), tried, note
+    if not seen.is_clearly_better(free.score - chosen.score, added, free.added, edges.least_block_sigmas):
+        return seen.terms(chosen, p_value), tried, ""
+    empirical = free.score - chosen.score > by.nonparametric_share * chosen.gain
+    named = [replace(each, empirical=empirical) for each in seen.terms(best if empirical else chosen, p_value)]
+    varies = "varies" if empirical else "also varies"
+    return named, tried, f"the noise {varies} with {free.name}, which no effect of the catalogue explains"
 
 
 @dataclass(frozen=True)
@@ -240,6 +240,7 @@ class _SquaredDeviations:
         """The best fit of one effect."""
         return max(self.singles, key=lambda fit: fit.score)
 
+    @cached_property
     def pairs(self) -> list[VarianceFit]:
         """Fits of two different effects together."""
         return [
@@ -248,63 +249,53 @@ class _SquaredDeviations:
             if self.candidates[first].name != self.candidates[second].name
         ]
 
+    @property
+    def best_pair(self) -> VarianceFit:
+        """The best fit of two effects; that of one if there is no other."""
+        return max(self.pairs, key=lambda fit: fit.score, default=self.best)
+
     def scores(self) -> list[VarianceScore]:
         """Scores of the effects, best first. Of an effect that was tried with several values of a parameter, the best counts."""
         tried = [VarianceScore(each.name, fit.gain, fit.score) for each, fit in zip(self.candidates, self.singles, strict=True)]
         best = {item.name: item for item in sorted(tried, key=lambda item: item.score)}
         return sorted(best.values(), key=lambda item: -item.score)
 
-    def fits_better(self, pair: VarianceFit, single: VarianceFit) -> bool:
-        """Whether two effects fit clearly better than one all over the wall."""
-        agreement = self._agreement(single.added(self.shapes), pair.added(self.shapes))
-        return pair.score > single.score + _least_lead(self.best.gain) and agreement > thresholds().edges.block_sigmas
+    def is_clearly_better(self, lead: float, first: FloatArray, second: FloatArray, least_sigmas: float) -> bool:
+        """Whether a second added variance (n,) fits clearly better than a first, and the wall blocks agree by `least_sigmas`.
 
-    def free_form_fits_better(self, free: BinnedVariance, chosen: VarianceFit) -> bool:
-        """Whether a variance that is free in bins fits clearly better than noise effects all over the wall."""
-        agreement = self._agreement(chosen.added(self.shapes), free.added)
-        return free.score - chosen.score > _least_lead(self.best.gain) and agreement > thresholds().edges.least_block_sigmas
-
-    def _agreement(self, first: FloatArray, second: FloatArray) -> float:
-        """Return how far wall blocks agree that the second variance fits better, so that the gain is not due to a few blocks.
-
-        It is the log-likelihood ratio over the root sum of squares of the wall blocks' contributions.
+        lead: difference of their scores, which must exceed the inexact part of the best effect, whose form is never exact.
         """
         terms = 0.5 * (self.squares * (second - first) / ((1 + first) * (1 + second)) + np.log1p(first) - np.log1p(second))
         sums = np.bincount(np.unique(self.block, return_inverse=True)[1], terms)
-        return float(sums.sum()) / max(float(np.linalg.norm(sums)), 1e-300)
+        least = max(thresholds().variance.least_gain, thresholds().mean.class_share * self.best.gain)
+        return lead > least and agreement(sums) > least_sigmas
 
-    def terms(self, chosen: VarianceFit, pairs: list[VarianceFit], p_value: float) -> list[VarianceTerm]:
-        """Describe each effect of a fit, with those that cannot be told from it. pairs: the fits of two effects."""
-        return [self._term(place, chosen, pairs, p_value) for place in range(len(chosen.members))]
-
-    def _term(self, place: int, chosen: VarianceFit, pairs: list[VarianceFit], p_value: float) -> VarianceTerm:
-        number, theta = chosen.members[place], chosen.theta[place]
-        candidate, margin = self.candidates[number], equivalence_margin(chosen.gain)
-        others = [fit for fit in (self.singles if len(chosen.members) == 1 else pairs) if fit.replaces_only(chosen, number)]
-        pair = max(pairs, key=lambda fit: fit.score, default=chosen)
-        # two other effects that fit better, but by no more than the inexact part of one, may be the truth as well
-        also = len(chosen.members) == 1 and number not in pair.members
-        others += [pair] if also and pair.score > chosen.score + thresholds().variance.least_gain else []
-        near = {self.candidates[n].name for fit in others if fit.score > chosen.score - margin for n in fit.members}
-        alone = (fit.gain for fit in self.singles if fit.members != (number,) and fit.members[0] in chosen.members)
-        return VarianceTerm(
-            effect=candidate.name,
-            indistinguishable=tuple(sorted(near - {self.candidates[each].name for each in chosen.members})),
-            p_value=p_value,
-            gain=chosen.gain - max(alone, default=0.0),
-            parameters=candidate.parameters(theta),
-            std=candidate.standard_deviations(theta, chosen.error[place]),
-            empirical=False,
-            variance=candidate.variance @ theta,
-        )
-
-
-def _least_lead(gain: float) -> float:
-    """Return by how much a second effect or a free form must score more than the best effect, whose form is never exact.
-
-    gain: log-likelihood ratio of the best effect.
-    """
-    return max(thresholds().variance.least_gain, thresholds().mean.class_share * gain)
+    def terms(self, chosen: VarianceFit, p_value: float) -> list[VarianceTerm]:
+        """Describe each effect of a fit, with those that cannot be told from it."""
+        found, pair, single = [], self.best_pair, len(chosen.members) == 1
+        tried, least = self.singles if single else self.pairs, chosen.score - equivalence_margin(chosen.gain)
+        for number, theta, error in zip(chosen.members, chosen.theta, chosen.error, strict=True):
+            candidate = self.candidates[number]
+            kept = {*chosen.members} - {number}
+            others = [fit for fit in tried if number not in fit.members and kept <= {*fit.members}]
+            # two other effects that fit better, but by no more than the inexact part of one, may be the truth as well
+            also = single and number not in pair.members
+            others += [pair] if also and pair.score > chosen.score + thresholds().variance.least_gain else []
+            near = {self.candidates[n].name for fit in others if fit.score > least for n in fit.members}
+            alone = (fit.gain for fit in self.singles if fit.members != (number,) and fit.members[0] in chosen.members)
+            found.append(
+                VarianceTerm(
+                    effect=candidate.name,
+                    indistinguishable=tuple(sorted(near - {self.candidates[each].name for each in chosen.members})),
+                    p_value=p_value,
+                    gain=chosen.gain - max(alone, default=0.0),
+                    parameters=candidate.parameters(theta),
+                    std=candidate.standard_deviations(theta, error),
+                    empirical=False,
+                    variance=candidate.variance @ theta,
+                )
+            )
+        return found
 
 
 def _describe_shared_variance(excess: float, unshared: float, sigma: FloatArray) -> str:
@@ -336,7 +327,7 @@ def _unshared_share(residuals: Residuals, value: FloatArray, used: BoolArray, ad
 class NoiseRatio:
     """Observed over predicted standard deviation of residuals, to tell whether the sensor model's noise is right.
 
-    It is computed from deviations from planes in small squares of the wall, without errors that vary slowly over the wall.
+    Errors that vary slowly over the wall do not count, as in `standardised_deviations`.
 
     Attributes
     ----------
@@ -353,9 +344,7 @@ class NoiseRatio:
 
         Parameters
         ----------
-        residuals : residuals of n points with their predicted standard deviations.
-        cells : small squares of the wall; deviations from a plane within each are used.
-        value : (n,) residuals after the systematic effects are removed, m (ranges) or px (disparities).
+        residuals, cells, value : arguments of `standardised_deviations`.
         random : source of random numbers, with which correlated noise is simulated.
         """
         z = standardised_deviations(residuals, cells, value)
@@ -364,8 +353,7 @@ class NoiseRatio:
             return cls(1.0, False)
         squares = np.minimum(z[used] ** 2, _CLIP_SIGMAS**2) / _expected_mean_square(residuals, cells, random)
         means = np.bincount(np.unique(cells.blocks.numbers(residuals.wall_xy[used]), return_inverse=True)[1], squares - 1)
-        below = float(means.sum()) < -thresholds().edges.block_sigmas * float(np.linalg.norm(means))
-        return cls(float(np.sqrt(squares.mean())), below)
+        return cls(float(np.sqrt(squares.mean())), agreement(means) < -thresholds().edges.block_sigmas)
 
     @property
     def at_most_one(self) -> float:

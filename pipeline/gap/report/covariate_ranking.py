@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.gap.naming.workflow import GapDiagnosis
-from pipeline.gap.residuals.residuals import ExpectedPulses, Residuals
+from pipeline.gap.residuals.residuals import BoolArray, ExpectedPulses, Residuals
 from pipeline.gap.residuals.wall_blocks import wall_blocks_by_points
 from scene.geometry.mesh import FloatArray
 
@@ -37,38 +37,21 @@ def rank_disagreements(found: GapDiagnosis) -> list[dict[str, Any]]:
     -------
     list : at most ten entries of `where` in gap.json, the most significant first. Keys: `covariate`; `statistic` ("mean",
         "spread" for standard deviation, "shape" for outliers, "missing" for lost returns); `p_value`; `region`, the bin's
-        limits; and `size_m`, the difference in m (0 for lost returns). That of a mean is positive if the measured surface lies
-        deeper than predicted. Entries on lost returns also have `share_lost` of the bin and `share_lost_overall`, 0 to 1.
+        limits; and `size_m`, the difference in m (0 for lost returns), positive for a mean if the measured surface lies deeper
+        than predicted. Entries on lost returns also have `share_lost` of the bin and `share_lost_overall`, 0 to 1.
     """
-    residuals = found.residuals
-    rows = [row for name, x, z in standardised_by_covariate(found) for row in _rank_statistics(name, x, z, residuals)]
-    if residuals.expected_pulses is not None and residuals.expected_pulses.lost.any():
-        patch = wall_blocks_by_points(
-            residuals.expected_pulses.wall_xy, max(len(residuals.expected_pulses.lost) / _PATCHES, _LEAST_PULSES)
-        )
-        rows += [
-            _rank_losses(name, x, residuals.expected_pulses, patch) for name, x in residuals.expected_pulses.covariates.items()
-        ]
+    residuals, used = found.residuals, inliers(found)
+    rows, pulses, z = [], residuals.expected_pulses, found.before[used] / residuals.sigma[used]
+    if used.any():
+        for name, x in residuals.covariates.items():
+            rows += _rank_statistics(name, x[used], z, residuals)
+    if pulses is not None and pulses.lost.any():
+        patch = wall_blocks_by_points(pulses.wall_xy, max(len(pulses.lost) / _PATCHES, _LEAST_PULSES))
+        rows += [_rank_losses(name, x, pulses, patch) for name, x in pulses.covariates.items()]
     return sorted(rows, key=lambda row: (row["p_value"], -abs(row["size_m"])))[:_MOST_ROWS]
 
 
-def standardised_by_covariate(found: GapDiagnosis) -> list[tuple[str, FloatArray, FloatArray]]:
-    """Return the standardised residuals of a diagnosis against each covariate, such as range, to plot or rank them.
-
-    The residuals are those of the model without the named effects, divided by their predicted standard deviations.
-
-    Returns
-    -------
-    list : for each covariate its name, its (m,) values at the m points that are no outliers, and the (m,) standardised
-        residuals.
-    """
-    residuals = found.residuals
-    used = inliers(found)
-    z = found.before[used] / residuals.sigma[used]
-    return [(name, values[used], z) for name, values in residuals.covariates.items()] if used.any() else []
-
-
-def inliers(found: GapDiagnosis) -> Any:
+def inliers(found: GapDiagnosis) -> BoolArray:
     """Tell which of the n points of a diagnosis are used in profiles and rankings, as an (n,) mask.
 
     They lie on smooth, stable rock and not within 0.3 m of a region where the rock changed. Their residual without the named
@@ -112,15 +95,11 @@ def _rank_statistics(name: str, x: FloatArray, z: FloatArray, residuals: Residua
     tails = np.bincount(group, beyond, size) / count - _TAIL_SHARE
     metres = float(np.median(residuals.sigma * residuals.unit_m))
     deeper = float(np.sign(np.median(residuals.depth_m)))
-    found = []
-    for statistic, deviation, sigmas in (
-        ("mean", deeper * mean, np.abs(mean) * np.sqrt(effective)),
-        ("spread", deviation_of_bin - 1, np.abs(deviation_of_bin - 1) * np.sqrt(2 * effective)),
-        ("shape", _TAIL * tails, np.abs(tails) * np.sqrt(count / _TAIL_SHARE)),
-    ):
-        worst = int(np.argmax(sigmas))
-        found.append(_entry(name, statistic, edges, worst, float(sigmas[worst]), float(deviation[worst]) * metres))
-    return found
+    return [
+        _entry(name, "mean", edges, np.abs(mean) * np.sqrt(effective), deeper * mean * metres),
+        _entry(name, "spread", edges, np.abs(deviation_of_bin - 1) * np.sqrt(2 * effective), (deviation_of_bin - 1) * metres),
+        _entry(name, "shape", edges, np.abs(tails) * np.sqrt(count / _TAIL_SHARE), _TAIL * tails * metres),
+    ]
 
 
 def _rank_losses(name: str, x: FloatArray, missing: ExpectedPulses, patch: NDArray[np.int64]) -> dict[str, Any]:
@@ -140,13 +119,13 @@ def _rank_losses(name: str, x: FloatArray, missing: ExpectedPulses, patch: NDArr
     independent = max(share * (1 - share), 1e-9)
     clustering = max(float(scatter.sum()) / (independent * len(group)), 1.0)
     sigmas = np.abs(bin_share - share) * count / np.sqrt(np.maximum(scatter, clustering * independent * count))
+    row = _entry(name, "missing", edges if len(edges) > 1 else np.repeat(edges, 2), sigmas, np.zeros(size))
+    return {**row, "share_lost": float(bin_share[np.argmax(sigmas)]), "share_lost_overall": share}
+
+
+def _entry(name: str, statistic: str, edges: FloatArray, sigmas: FloatArray, sizes_m: FloatArray) -> dict[str, Any]:
+    """Entry of `where` for the most significant bin. Its p-value is a Gaussian tail bound for the largest of all bins."""
     worst = int(np.argmax(sigmas))
-    row = _entry(name, "missing", edges if len(edges) > 1 else np.repeat(edges, 2), worst, float(sigmas[worst]), 0.0)
-    return {**row, "share_lost": float(bin_share[worst]), "share_lost_overall": share}
-
-
-def _entry(name: str, statistic: str, edges: FloatArray, worst: int, sigmas: float, size_m: float) -> dict[str, Any]:
-    """One entry of `where`. p_value: Gaussian tail bound for the largest of all bins."""
-    p_value = float(min(1.0, max(2 * len(edges) * np.exp(-(sigmas**2) / 2), _LEAST_P)))
+    p_value = float(min(1.0, max(2 * len(edges) * np.exp(-(float(sigmas[worst]) ** 2) / 2), _LEAST_P)))
     region = {"from": float(edges[worst]), "to": float(edges[worst + 1])}
-    return {"covariate": name, "statistic": statistic, "p_value": p_value, "region": region, "size_m": size_m}
+    return {"covariate": name, "statistic": statistic, "p_value": p_value, "region": region, "size_m": float(sizes_m[worst])}

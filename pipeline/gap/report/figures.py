@@ -7,15 +7,13 @@ from typing import Any
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.image import AxesImage
 from matplotlib.patches import Rectangle
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
-from numpy.typing import NDArray
 
 from pipeline.change.robust import nmad
 from pipeline.gap.naming.gap_score import Gap
 from pipeline.gap.naming.workflow import GapDiagnosis
-from pipeline.gap.report.covariate_ranking import inliers, quantile_bins, standardised_by_covariate
+from pipeline.gap.report.covariate_ranking import inliers, quantile_bins
 from pipeline.gap.report.wording import covariate_with_unit
 from pipeline.gap.residuals.surface_residuals import SurfaceResiduals, predicted_sigma
 from pipeline.gap.residuals.tls_residuals import TlsResiduals
@@ -28,7 +26,7 @@ from sensors.models.sensor_model import StereoModel, TlsModel
 _BINS = 24
 _POINTS_PER_PIXEL = 8.0
 _BEFORE, _AFTER, _NAMED = "#D55E00", "#0072B2", "black"
-DEPTH_LABEL = "surface deeper than predicted, mm; missing rock positive"
+_DEPTH_LABEL = "surface deeper than predicted, mm; missing rock positive"
 _MOST_NMAD = 6.0
 """Times the NMAD of a map's values beyond which they do not influence its colours."""
 _PLATE = {"facecolor": "white", "edgecolor": "none", "pad": 0.5}
@@ -57,14 +55,16 @@ def maps_figure(found: GapDiagnosis) -> bytes:
     ratios = [
         pixels.standard_deviation(values / sigma) for values, sigma in zip((found.before, found.after), sigmas, strict=True)
     ]
-    for panel, values, title in zip(panels[0], means, ("before", "after"), strict=True):
-        image = panel.imshow(values, cmap=COLOURS, vmin=-limit, vmax=limit, extent=pixels.extent, origin="lower")
-        panel.set_title(f"mean residual, {title}", fontsize=10)
-    _colour_bar(figure, image, panels[0], DEPTH_LABEL)
-    for panel, values, title in zip(panels[1], ratios, ("before", "after"), strict=True):
-        image = panel.imshow(values, cmap="PuOr_r", vmin=0.4, vmax=1.6, extent=pixels.extent, origin="lower")
-        panel.set_title(f"standard deviation over the predicted one, {title}", fontsize=10)
-    _colour_bar(figure, image, panels[1], "1: as predicted")
+    rows: tuple[tuple[list[FloatArray], str, str, dict[str, Any]], ...] = (
+        (means, "mean residual", _DEPTH_LABEL, {"cmap": COLOURS, "vmin": -limit, "vmax": limit}),
+        (ratios, "standard deviation over the predicted one", "1: as predicted", {"cmap": "PuOr_r", "vmin": 0.4, "vmax": 1.6}),
+    )
+    for row, (maps, what, label, colours) in zip(panels, rows, strict=True):
+        for panel, values, title in zip(row, maps, ("before", "after"), strict=True):
+            image = panel.imshow(values, extent=pixels.extent, origin="lower", **colours)
+            panel.set_title(f"{what}, {title}", fontsize=10)
+        # below the maps, the label has room even if they are low
+        figure.colorbar(image, ax=row, label=label, extend="both", location="bottom", shrink=0.6, aspect=45)
     for panel in panels.ravel():
         panel.set_facecolor("0.85")
         panel.set_anchor("N")  # if centred, the title of a low map could lie outside of the figure
@@ -84,21 +84,10 @@ def _colour_limit(means: FloatArray) -> float:
     return (min(top, usual) if usual > 0 else top) or 1.0
 
 
-def _colour_bar(figure: Figure, image: AxesImage, panels: NDArray[np.object_], label: str) -> None:
-    """Draw a colour bar below a row of maps, where its label has room even if the maps are low."""
-    figure.colorbar(image, ax=panels, label=label, extend="both", location="bottom", shrink=0.6, aspect=45)
-
-
 def sigma_after(found: GapDiagnosis) -> FloatArray:
     """Return the standard deviation of each point's noise that the sensor model with the named effects predicts.
 
-    Returns
-    -------
-    FloatArray : (n,) standard deviations, in the unit of the observable (m or px).
-
-    Raises
-    ------
-    TypeError : model and residuals are of different sensors.
+    They are (n,) in the unit of the observable (m or px). Raises TypeError if model and residuals are of different sensors.
     """
     match found.model_after, found.residuals:
         case TlsModel() as model, TlsResiduals(geometry=rays) as ranges:
@@ -116,13 +105,13 @@ def profiles_figure(found: GapDiagnosis) -> bytes:
     Two colours show the residuals without and with the named effects, with bands of two standard errors. A black line shows
     what the effects explain, and dashed lines the predicted standard deviation.
     """
-    names = [name for name, _, _ in standardised_by_covariate(found)]
+    used = inliers(found)
+    names = list(found.residuals.covariates) if used.any() else []
     rows = max((len(names) + _COLUMNS - 1) // _COLUMNS, 1)
     figure = Figure(figsize=(11.5, 4.0 * rows))
     panels = np.atleast_2d(figure.subplots(2 * rows, _COLUMNS, height_ratios=[1.4, 1.0] * rows))
     # fixed margins in inches: a computed layout takes as long as the drawing
     figure.subplots_adjust(0.055, 0.3 / (4.0 * rows), 0.99, 1 - 0.3 / (4.0 * rows), wspace=0.22, hspace=0.33)
-    used = inliers(found)
     unit = 1e3 * found.residuals.depth_m[used]
     before, after = found.before[used] * unit, found.after[used] * unit
     predicted = found.residuals.sigma[used] * np.abs(unit), sigma_after(found)[used] * np.abs(unit)
@@ -132,13 +121,10 @@ def profiles_figure(found: GapDiagnosis) -> bytes:
         x = found.residuals.covariates[name][used]
         edges, group = quantile_bins(x, _BINS)
         if len(edges) < 3:
-            upper.set_visible(False)
-            lower.set_visible(False)
             continue
         middle = (edges[1:] + edges[:-1]) / 2
         for values, colour, label in ((before, _BEFORE, "before"), (after, _AFTER, "after")):
-            _mean_band(upper, middle, group, values, colour, label)
-            _std_band(lower, middle, group, values, colour)
+            _draw_bands(upper, lower, middle, group, values, color=colour, label=label)
         if found.effects:
             upper.plot(middle, _means(group, before - after, len(middle)), color=_NAMED, linewidth=1.4, label="named effects")
         for sigma, colour in zip(predicted, (_BEFORE, _AFTER), strict=True):
@@ -262,19 +248,12 @@ def _means(group: Any, values: FloatArray, size: int) -> FloatArray:
     return np.asarray(np.bincount(group, values, size) / np.maximum(np.bincount(group, minlength=size), 1))
 
 
-def _mean_band(panel: Any, middle: FloatArray, group: Any, values: FloatArray, colour: str, label: str) -> None:
-    """Draw the mean of each bin with a band of two standard errors."""
-    mean = _means(group, values, len(middle))
+def _draw_bands(upper: Axes, lower: Axes, middle: FloatArray, group: Any, values: FloatArray, *, color: str, label: str) -> None:
+    """Draw mean (upper panel) and standard deviation (lower panel) of each bin, with bands of two standard errors."""
     count = np.maximum(np.bincount(group, minlength=len(middle)), 1)
-    error = 2 * np.sqrt(np.maximum(_means(group, values**2, len(middle)) - mean**2, 0) / count)
-    panel.plot(middle, mean, color=colour, linewidth=1.0, label=label)
-    panel.fill_between(middle, mean - error, mean + error, color=colour, alpha=0.25, linewidth=0)
-
-
-def _std_band(panel: Any, middle: FloatArray, group: Any, values: FloatArray, colour: str) -> None:
-    """Draw the standard deviation of each bin with a band of two standard errors."""
     mean = _means(group, values, len(middle))
-    spread = np.sqrt(np.maximum(_means(group, values**2, len(middle)) - mean**2, 0))
-    error = 2 * spread / np.sqrt(2 * np.maximum(np.bincount(group, minlength=len(middle)), 1))
-    panel.plot(middle, spread, color=colour, linewidth=1.0)
-    panel.fill_between(middle, spread - error, spread + error, color=colour, alpha=0.25, linewidth=0)
+    variance = np.maximum(_means(group, values**2, len(middle)) - mean**2, 0)
+    spread = np.sqrt(variance)
+    for panel, line, error in ((upper, mean, np.sqrt(variance / count)), (lower, spread, spread / np.sqrt(2 * count))):
+        panel.plot(middle, line, color=color, linewidth=1.0, label=label)
+        panel.fill_between(middle, line - 2 * error, line + 2 * error, color=color, alpha=0.25, linewidth=0)

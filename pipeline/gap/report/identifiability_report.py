@@ -6,7 +6,6 @@ They are identifiability.json, report.html and a figure of the matrix for each s
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -24,19 +23,6 @@ _INSTRUMENTS = {"stereo": "Stereo pair", "tls": "Laser scanner"}
 _WORTHWHILE_RATIO = 0.8
 """An additional measurement is shown if it lowers the size from which an effect can be named to this share."""
 _NEVER = "never"
-
-
-@dataclass(frozen=True)
-class _Row:
-    """One row of the page's table of effects."""
-
-    name: str
-    parameter: str
-    survival: str
-    detectable_size: str
-    nameable_size: str
-    alike: str
-    extension: str
 
 
 def write_identifiability(out: Path, found: Sequence[Identifiability]) -> Path:
@@ -113,21 +99,20 @@ def _part(found: Identifiability, picture: bytes) -> dict[str, Any]:
     }
 
 
-def _row(found: Identifiability, row: int) -> _Row:
-    """The table's row of one effect."""
+def _row(found: Identifiability, row: int) -> dict[str, str]:
+    """The row of one effect in the page's table of effects."""
     best, named = found.best_extension(row), found.nameable_size[row]
     helps = best.nameable_size[row] < _WORTHWHILE_RATIO * named
-    return _Row(
-        name=found.names[row] + (f" ({found.variants[row]})" if found.variants[row] else ""),
-        parameter=found.parameters[row],
-        survival=f"{100 * found.survival[row]:.1f} %",
-        detectable_size=_format_value("", found.detectable_size[row]),
-        nameable_size=_format_value("", named),
-        alike=", ".join(
-            f"{found.names[other].partition('.')[2]} {found.cosines[row, other]:.2f}" for other in found.similar_effects(row)
-        ),
-        extension=f"{_format_value('', best.nameable_size[row])} with {best.name}" if helps else "",
-    )
+    alike = (f"{found.names[other].partition('.')[2]} {found.cosines[row, other]:.2f}" for other in found.similar_effects(row))
+    return {
+        "name": found.names[row] + (f" ({found.variants[row]})" if found.variants[row] else ""),
+        "parameter": found.parameters[row],
+        "survival": f"{100 * found.survival[row]:.1f} %",
+        "detectable_size": _format_value("", found.detectable_size[row]),
+        "nameable_size": _format_value("", named),
+        "alike": ", ".join(alike),
+        "extension": f"{_format_value('', best.nameable_size[row])} with {best.name}" if helps else "",
+    }
 
 
 def _format_value(parameter: str, value: float) -> str:

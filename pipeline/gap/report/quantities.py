@@ -33,15 +33,15 @@ def format_with_std(key: str, value: float, std: float | None = None) -> str:
     unit, factor, step = _choose_unit(key, value, std)
     value *= factor
     if not std or not math.isfinite(std):
-        return _join_unit(f"{float(f'{value:.4g}'):g}", unit)
+        return f"{float(f'{value:.4g}'):g} {unit}".rstrip()
     std *= factor
     if step is None:
         step = 10.0 ** (_exponent(value) - _DIGITS + 1) if value else 0.0
     if std < step / 2:
-        return _join_unit(f"{_round_to_step(value, step)} \N{PLUS-MINUS SIGN} < {_round_to_step(step, step)}", unit)
+        return f"{_round_to_step(value, step)} \N{PLUS-MINUS SIGN} < {_round_to_step(step, step)} {unit}".rstrip()
     leading, exponent = f"{std:.1e}".split("e")
     last = max(10.0 ** (int(exponent) - leading.startswith("1")), step)
-    return _join_unit(f"{_round_to_step(value, last)} \N{PLUS-MINUS SIGN} {_round_to_step(std, last)}", unit)
+    return f"{_round_to_step(value, last)} \N{PLUS-MINUS SIGN} {_round_to_step(std, last)} {unit}".rstrip()
 
 
 def _choose_unit(key: str, value: float, std: float | None) -> tuple[str, float, float | None]:
@@ -67,8 +67,3 @@ def _round_to_step(value: float, step: float) -> str:
 def _exponent(value: float) -> int:
     """Decimal exponent of the first significant digit."""
     return int(f"{abs(value):e}".partition("e")[2])
-
-
-def _join_unit(text: str, unit: str) -> str:
-    """Append a unit, if there is one."""
-    return f"{text} {unit}" if unit else text

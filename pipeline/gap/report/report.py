@@ -21,7 +21,6 @@ from pipeline.gap.report.datum_scale import estimate_scale
 from pipeline.gap.report.figures import gap_figure, maps_figure, matrix_figure, profiles_figure
 from pipeline.gap.report.unseen import reference_line, unseen_entry, unseen_line, unseen_rows
 from pipeline.gap.report.wording import (
-    answer,
     covariate_with_unit,
     describe_gap,
     format_decimal,
@@ -29,15 +28,14 @@ from pipeline.gap.report.wording import (
     format_parameters,
     format_value,
     outcome,
+    paragraph,
     round_entry,
     title,
-    variance_outcome,
     verdict_in_words,
 )
 from pipeline.gap.residuals.surface_residuals import SurfaceResiduals
 from pipeline.gap.thresholds import use_thresholds
 from pipeline.report.page import p_value_in_words, template
-from scene.geometry.mesh import FloatArray
 
 _MOST_TRIED = 25
 """Most explanations that the report lists."""
@@ -48,13 +46,14 @@ def to_dict(found: GapDiagnosis, measurement: Measurement) -> dict[str, Any]:
 
     found: the diagnosis. measurement: the measurement that was diagnosed; it is needed to give positions in the world frame.
     """
-    with use_thresholds(found.thresholds):
-        return _to_dict(found, measurement)
-
-
-def _to_dict(found: GapDiagnosis, measurement: Measurement) -> dict[str, Any]:
     pose = found.residuals.datum[:6] @ found.pose if isinstance(found.residuals, SurfaceResiduals) else found.pose
-    poses = [_registration(pose[start : start + 6], measurement) for start in range(0, len(pose), 6)]
+    to_world = measurement.frame.rotation.T
+    poses = [
+        {"translation_m": (to_world @ each[:3]).tolist(), "rotation_rad": (to_world @ each[3:]).tolist()}
+        for each in np.split(pose, range(6, len(pose), 6))
+    ]
+    with use_thresholds(found.thresholds):
+        gap = found.gap.to_dict() if found.gap else None
     return {
         "schema": 1,
         "verdict": found.verdict,
@@ -65,7 +64,7 @@ def _to_dict(found: GapDiagnosis, measurement: Measurement) -> dict[str, Any]:
         "registration": poses[0] | _scale_entry(found),
         **({"further_registrations": poses[1:]} if len(poses) > 1 else {}),
         "identifiability": found.identifiability,
-        "gap": found.gap.to_dict() if found.gap else None,
+        "gap": gap,
         "remaining": found.remaining,
         "detectable": unseen_entry(found),
         "reference_error_m": found.reference_sigma * float(np.median(found.residuals.unit_m)) if len(found.residuals) else None,
@@ -80,12 +79,6 @@ def _scale_entry(found: GapDiagnosis) -> dict[str, Any]:
         return {}
     scale = estimate_scale(found)
     return {"scale_ppm": {"value": None, "std": None} if scale is None else scale.to_dict()}
-
-
-def _registration(pose: FloatArray, measurement: Measurement) -> dict[str, Any]:
-    """The pose (6,) of a set-up, converted from the wall frame to the world frame."""
-    axes = measurement.frame.rotation
-    return {"translation_m": (axes.T @ pose[:3]).tolist(), "rotation_rad": (axes.T @ pose[3:]).tolist()}
 
 
 def write_report(out: Path, found: GapDiagnosis, measurement: Measurement) -> Path:
@@ -107,7 +100,7 @@ def write_report(out: Path, found: GapDiagnosis, measurement: Measurement) -> Pa
     Path : path of report.html.
     """
     with use_thresholds(found.thresholds):
-        parts = contributions(found, measurement) if len(found.effects) > 1 else np.empty((0, len(found.before)))
+        parts = contributions(found, measurement) if len(found.effects) > 1 else ()
         pictures = _pictures(found)
         page = _render_page(found, pictures)
     write_json(out / "gap.json", to_dict(found, measurement))
@@ -128,29 +121,25 @@ def write_report(out: Path, found: GapDiagnosis, measurement: Measurement) -> Pa
 def summarise(found: GapDiagnosis) -> str:
     """Return the result of a diagnosis as lines for the terminal: verdict, named effects, scores, and what may be hidden."""
     with use_thresholds(found.thresholds):
-        return _summary(found)
-
-
-def _summary(found: GapDiagnosis) -> str:
-    lines, scale = [f"{found.verdict}: {verdict_in_words(found)}"], estimate_scale(found)
-    lines += [] if scale is None else [f"  {scale.words}"]
-    if found.verdict == "insufficient_data":
-        lines += [f"  {found.remaining['note']}", f"  to measure: {_describe_needed_data(found)}"]
-    for effect in found.effects:
-        alike = f"; cannot be told from {', '.join(effect.indistinguishable)}" if effect.indistinguishable else ""
-        lines.append(f"  {effect.name} ({format_parameters(effect)}){alike}")
-    if found.changes:
-        regions = "1 region" if len(found.changes) == 1 else f"{len(found.changes)} regions"
-        lines.append(f"  set aside: {regions} where the scene itself moved")
-    if found.gap is not None:
-        factor, unit = found.gap.display_unit
-        scores = ", ".join(f"{factor * value:.3f} {unit} {name}" for name, value in found.gap.scores.items())
-        lines.append(f"  gap {scores}: {describe_closing(found.gap, found.model_changed)}")
-    lines += [f"  {line}"] if (line := unseen_line(found)) else []
-    lines += [f"  {line}"] if (line := reference_line(found)) else []
-    if found.verdict in ("no_gap", "unknown") and found.remaining.get("note"):
-        lines.append(f"  note: {found.remaining['note']}")
-    return "\n".join(lines)
+        lines, scale = [f"{found.verdict}: {verdict_in_words(found)}"], estimate_scale(found)
+        lines += [] if scale is None else [f"  {scale.words}"]
+        if found.verdict == "insufficient_data":
+            lines += [f"  {found.remaining['note']}", f"  to measure: {_describe_needed_data(found)}"]
+        for effect in found.effects:
+            alike = f"; cannot be told from {', '.join(effect.indistinguishable)}" if effect.indistinguishable else ""
+            lines.append(f"  {effect.name} ({format_parameters(effect)}){alike}")
+        if found.changes:
+            regions = "1 region" if len(found.changes) == 1 else f"{len(found.changes)} regions"
+            lines.append(f"  set aside: {regions} where the scene itself moved")
+        if found.gap is not None:
+            factor, unit = found.gap.display_unit
+            scores = ", ".join(f"{factor * value:.3f} {unit} {name}" for name, value in found.gap.scores.items())
+            lines.append(f"  gap {scores}: {describe_closing(found.gap, found.model_changed)}")
+        lines += [f"  {line}"] if (line := unseen_line(found)) else []
+        lines += [f"  {line}"] if (line := reference_line(found)) else []
+        if found.verdict in ("no_gap", "unknown") and found.remaining.get("note"):
+            lines.append(f"  note: {found.remaining['note']}")
+        return "\n".join(lines)
 
 
 def _describe_needed_data(found: GapDiagnosis) -> str:
@@ -189,17 +178,17 @@ def _render_page(found: GapDiagnosis, pictures: dict[str, bytes]) -> str:
     return template("gap/report/report.html.jinja").render(
         found=found,
         title=title(found),
-        answer=answer(found, rows),
+        answer=paragraph(found, rows, scores=False),
         scores=describe_gap(found),
         advice=advice_on,
         page_of=page_of,
         pictures=pictures,
         where=rows,
-        tried=[(item, best - item.score, outcome(found, tried, item)) for item in tried[:_MOST_TRIED]],
+        tried=[(item, best - item.score, outcome(found, item)) for item in tried[:_MOST_TRIED]],
         more=max(len(tried) - _MOST_TRIED, 0),
         unseen=unseen_rows(found),
         reference_words=reference_line(found),
-        variance_tried=[(item, variance_outcome(found, item)) for item in found.variance_tried],
+        variance_tried=[(item, outcome(found, item)) for item in found.variance_tried],
         added=_yaml({"effects": [round_entry(effect.entry) for effect in found.effects]}),
         model=_yaml(after),
         number=format_number,

@@ -10,7 +10,7 @@ from pipeline.gap.mean.detection_power import POWER, DetectableSize
 from pipeline.gap.naming.workflow import GapDiagnosis
 from pipeline.gap.report.quantities import format_with_std
 from pipeline.gap.survey.identifiability import REFERENCE_ERRORS_M
-from sensors.effects import EFFECTS
+from sensors.effects import EFFECTS, effect_of
 
 _MOST_NAMED = 4
 """Effects that the line in the terminal lists."""
@@ -28,10 +28,8 @@ def unseen_entry(found: GapDiagnosis) -> list[dict[str, Any]]:
 def unseen_rows(found: GapDiagnosis) -> list[dict[str, str]]:
     """Return the rows of the report's table of sensor errors that may be there although the diagnosis did not name them.
 
-    Returns
-    -------
-    list : for each error the table's columns: `name`; `size`, from which it would have shown with a probability of 95 %; and
-        `note`: the period or camera for which the size holds, or why there is no size.
+    Each has `name`; `size`, from which it would have shown with a probability of 95 %; and `note`: the period or camera for
+    which the size holds, or why there is no size.
     """
     return [
         {
@@ -50,9 +48,10 @@ def unseen_line(found: GapDiagnosis) -> str:
     """
     sensor = found.residuals.sensor
     known = [each for each in found.unseen if np.isfinite(each.size) and each.parameter]
-    largest = sorted(known, key=lambda each: -each.size / _typical(each))[:_MOST_NAMED]
-    if not largest:
+    if not known:
         return ""
+    typical = {each.name: effect_of(each.name).typical_sizes() for each in known}
+    largest = sorted(known, key=lambda each: -each.size / typical[each.name].get(each.parameter, 1.0))[:_MOST_NAMED]
     named = ", ".join(f"{each.name} {_format(each, sensor)}" for each in largest)
     more = f"; {len(known) - len(largest)} more in report.html" if len(known) > len(largest) else ""
     return f"smaller effects than these may be hidden ({100 * POWER:.0f} % would have shown): {named}{more}"
@@ -80,11 +79,6 @@ def reference_line(found: GapDiagnosis) -> str:
 def _full_name(item: DetectableSize, sensor: str) -> str:
     """The name with the sensor as prefix; that of an error outside the catalogue as it is."""
     return f"{sensor}.{item.name}" if any(effect.tag() == item.name for effect in EFFECTS) else item.name
-
-
-def _typical(item: DetectableSize) -> float:
-    """Typical size of the effect's parameter."""
-    return next(effect.typical_sizes().get(item.parameter, 1.0) for effect in EFFECTS if effect.tag() == item.name)
 
 
 def _format(item: DetectableSize, sensor: str) -> str:

@@ -69,29 +69,19 @@ def title(found: GapDiagnosis) -> str:
             return f"Missing: {join_words(names)}"
 
 
-def paragraph(found: GapDiagnosis, rows: list[dict[str, Any]]) -> str:
-    """Return the outcome of a diagnosis as a paragraph: verdict, named effects, and scores of the model without and with them.
+def paragraph(found: GapDiagnosis, rows: list[dict[str, Any]], *, scores: bool = True) -> str:
+    """Return the outcome of a diagnosis as a paragraph: verdict, named effects, and how much of the gap they close.
+
+    The gap is the distance between sensor model and measurement.
 
     Parameters
     ----------
     found : diagnosis.
     rows : values of covariates, such as the range, where measurement and model differ most, from `rank_disagreements`.
+    scores : whether to state the scores of the model without and with the named effects. The top of the report leaves them out.
     """
-    return " ".join(each for each in (*_findings(found, rows), describe_gap(found), *_side_notes(found)) if each)
-
-
-def answer(found: GapDiagnosis, rows: list[dict[str, Any]]) -> str:
-    """Return the outcome of a diagnosis as a paragraph for the top of the report, with the share of the gap that closes.
-
-    The gap is the distance between sensor model and measurement. Its scores are left out, as the report shows them further
-    below.
-
-    Parameters
-    ----------
-    found : diagnosis.
-    rows : values of covariates, such as the range, where measurement and model differ most, from `rank_disagreements`.
-    """
-    return " ".join(each for each in (*_findings(found, rows), _describe_closed_gap(found), *_side_notes(found)) if each)
+    gap = describe_gap(found) if scores else _describe_closed_gap(found)
+    return " ".join(each for each in (*_findings(found, rows), gap, *_side_notes(found)) if each)
 
 
 def verdict_in_words(found: GapDiagnosis) -> str:
@@ -155,46 +145,31 @@ def _largest_disagreement(found: GapDiagnosis, rows: list[dict[str, Any]]) -> st
     return f"Before any effect was named, the disagreement was largest in the {statistic} against {join_words(seen)}."
 
 
-def outcome(found: GapDiagnosis, tried: Sequence[FamilyScore], item: FamilyScore) -> str:
-    """Say what became of one explanation of systematic residuals that the diagnosis tried, for the report's table.
+def outcome(found: GapDiagnosis, item: FamilyScore | VarianceScore) -> str:
+    """Say what became of one explanation that the diagnosis tried, for the report's tables.
 
     Parameters
     ----------
     found : diagnosis.
-    tried : all explanations that were tried, best first: systematic sensor errors, and empirical terms (curves without a
-        cause).
-    item : one of these.
+    item : one of `found.tried` (systematic sensor errors, and curves without a cause) or of `found.variance_tried` (noise terms).
 
     Returns
     -------
     str : "named", "cannot be told from the named one", "added as empirical" or "rejected".
     """
+    named = [each for each in found.effects if each.kind == ("empirical" if item.empirical else "physical")]
     if item.empirical:
-        added = {effect.entry.get("covariate") for effect in found.effects if effect.kind == "empirical"}
-        best = next(each for each in tried if each.empirical and each.name == item.name)
-        return "added as empirical" if item is best and item.name in added else "rejected"
-    return _outcome_of_effect(found, item.name)
-
-
-def variance_outcome(found: GapDiagnosis, item: VarianceScore) -> str:
-    """Say what became of one explanation of the residuals' scatter that the diagnosis tried, for the report's table.
-
-    found: diagnosis; item: one of the noise terms that were tried. Returns "named", "cannot be told from the named one", "added
-    as empirical" or "rejected".
-    """
-    if item.empirical:
-        added = any(effect.kind == "empirical" and effect.adds_variance for effect in found.effects)
+        if isinstance(item, VarianceScore):
+            added = any(effect.adds_variance for effect in named)
+        else:
+            forms = (each for each in found.tried if each.empirical and each.name == item.name)
+            best = max(forms, key=lambda each: each.score)
+            added = item is best and item.name in {effect.entry.get("covariate") for effect in named}
         return "added as empirical" if added else "rejected"
-    return _outcome_of_effect(found, item.name)
-
-
-def _outcome_of_effect(found: GapDiagnosis, effect: str) -> str:
-    """What became of an effect of the catalogue."""
-    name = f"{found.residuals.sensor}.{effect}"
-    physical = [each for each in found.effects if each.kind == "physical"]
-    if any(each.name == name for each in physical):
+    name = f"{found.residuals.sensor}.{item.name}"
+    if any(each.name == name for each in named):
         return "named"
-    alike = {other for each in physical for other in each.indistinguishable}
+    alike = {other for each in named for other in each.indistinguishable}
     return "cannot be told from the named one" if name in alike else "rejected"
 
 
@@ -206,10 +181,7 @@ def join_words(words: Sequence[str]) -> str:
 def covariate_with_unit(covariate: str, sensor: str) -> str:
     """Return a covariate (a quantity on which an error may depend) in words with its unit, such as "range, m".
 
-    Parameters
-    ----------
-    covariate : name of the covariate, such as "range".
-    sensor : "tls" or "stereo"; a covariate without a unit of its own has that of the observable, m or px.
+    sensor: "tls" or "stereo"; a covariate without a unit of its own has that of the observable, m or px.
     """
     _, unit = _COVARIATES.get(covariate, ("", ""))
     return f"{covariate_name(covariate)}, {unit or ('m' if sensor == 'tls' else 'px')}"
@@ -286,23 +258,19 @@ def _describe_empirical(effect: NamedEffect) -> str:
     """What an empirical term depends on."""
     covariates = [covariate_name(effect.entry[key]) for key in ("covariate", "second") if effect.entry.get(key)]
     if covariates:
-        return f"depends on {join_words(covariates)}{_describe_range(effect)}"
+        said = f"depends on {join_words(covariates)}"
+        if effect.effect is not SurfaceEmpirical:
+            return said
+        values = [each for row in effect.entry["values_m"] for each in row]
+        return f"{said} (by {format_number(1e3 * (max(values) - min(values)), 3)} mm from its lowest to its highest value)"
     lost = effect.effect.shows_in == ShowsIn.RETURNS
     return "is in the directions from which nothing returns" if lost else "is larger than the model predicts"
 
 
-def _describe_range(effect: NamedEffect) -> str:
-    """Range of the values of an empirical term of a surface."""
-    if effect.effect is not SurfaceEmpirical:
-        return ""
-    values = [each for row in effect.entry["values_m"] for each in row]
-    return f" (by {format_number(1e3 * (max(values) - min(values)), 3)} mm from its lowest to its highest value)"
-
-
 def describe_gap(found: GapDiagnosis) -> str:
-    """Return a sentence for the report with the scores of the sensor model without and with the named effects.
+    """Return a sentence with the scores of the sensor model without and with the named effects, and that of noise alone.
 
-    It also states the score that noise alone gives. It is "" if nothing was scored.
+    It is "" if nothing was scored.
     """
     if found.gap is None:
         return ""

@@ -7,6 +7,7 @@ Wall blocks are 3 x 3 cells; a whole block is used for fitting or for validation
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -108,3 +109,11 @@ def wall_blocks_by_points(at: FloatArray, points: float) -> NDArray[np.int64]:
     """
     side = float(np.sqrt(np.prod(np.ptp(at, axis=0)) / max(len(at) / points, 1.0))) or 1.0
     return np.asarray(np.unique(BlockGrid(at.min(axis=0), side).numbers(at), return_inverse=True)[1])
+
+
+def agreement(sums: NDArray[Any]) -> float:
+    """Return how far wall blocks agree that one model fits better than another, like a number of standard deviations.
+
+    It is the sum of their log-likelihood ratios (b,) over the root of the sum of squares, to which a few blocks add little.
+    """
+    return float(sums.sum()) / max(float(np.linalg.norm(sums)), 1e-300)

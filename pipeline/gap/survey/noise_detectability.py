@@ -83,10 +83,10 @@ def _variance_effects(view: SurveyView) -> list[NoiseOrLossEffect]:
         theta = DETECTION_SNR / np.sqrt(max(information, 1e-300))
         least = excess / max(float(np.mean(form)), 1e-300)
         note = "" if theta > least else f"smaller ones add less than {100 * excess:.0f} % to the variance and are not named"
-        value = candidate.parameters(np.full(len(candidate.names), max(theta, least)))[candidate.names[0]]
+        parameter, value = candidate.main_parameter(max(theta, least))
         name = f"{residuals.sensor}.{candidate.name}"
         if name not in found or value < found[name].detectable_size:
-            found[name] = NoiseOrLossEffect(name, candidate.names[0], float(value), note)
+            found[name] = NoiseOrLossEffect(name, parameter, value, note)
     return list(found.values())
 
 
