@@ -185,7 +185,7 @@ def apply_smoothing(effects: Iterable[Effect], geometry: PixelGeometry, columns:
     step = raster_cell_px(geometry.u, geometry.v) if filters else None
     if step is None or raster_cell_count(geometry.u, geometry.v, step) > MOST_CELLS:
         return columns
-    row, column = _cell(geometry.v, step), _cell(geometry.u, step)
+    row, column = cell_numbers(geometry.v, step), cell_numbers(geometry.u, step)
     matched = np.zeros((int(row.max()) + 1, int(column.max()) + 1), dtype=bool)
     matched[row, column] = np.isfinite(columns).all(axis=1)
     low_passes = [LowPass.over(matched, effect.sigma_px / step) for effect in filters]
@@ -222,12 +222,15 @@ def _raster_axis(x: FloatArray, step: float, size: int) -> tuple[FloatArray, NDA
     clouds are cropped after matching.
     """
     before, after = (int(np.clip(room // step, 0, _MARGIN)) for room in (x.min(), size - x.max()))
-    cell = _cell(x, step)
+    cell = cell_numbers(x, step)
     return np.asarray(x.min() + step * np.arange(-before, int(cell.max()) + 1 + after), dtype=np.float64), cell + before
 
 
-def _cell(x: FloatArray, step: float) -> NDArray[np.int64]:
-    """(n,) number of the row or column of each point, counted from the first, with `step` px each."""
+def cell_numbers(x: FloatArray, step: float) -> NDArray[np.int64]:
+    """Return the number (n,) of the column (or row) of a raster in which each point lies, counted from the first.
+
+    x: (n,) columns (or rows) of the points' pixels, px; step: spacing of the raster's cells, px.
+    """
     return np.rint((x - x.min()) / step).astype(np.int64)
 
 
