@@ -34,7 +34,7 @@ def found_in(seen: Scan, value: Array, epoch: Any = None) -> list[SceneChange]:
     geometry = RayGeometry(seen.azimuth, seen.zenith)
     residuals = TlsResiduals(value, SIGMA * one, one, true, true, np.zeros((n, 6)), at, covariates, np.arange(n), geometry)
     plane = np.stack([seen.azimuth, seen.zenith], axis=1)
-    sight = SensorView(plane, np.zeros(n, dtype=int) if epoch is None else epoch, np.zeros(3), seen.ray, seen.plane)
+    sight = SensorView(plane, np.zeros(n, dtype=int) if epoch is None else epoch, np.zeros((n, 3)), seen.ray, seen.plane)
     return find_scene_changes(residuals, sight, true)[0]
 
 

@@ -22,7 +22,7 @@ from pipeline.gap.residuals.sensor_view import SensorView
 from pipeline.gap.residuals.several_scans import simulate_range_errors
 from pipeline.gap.residuals.tls_residuals import TlsResiduals, with_scan_order
 from pipeline.gap.survey.identifiability import identifiability
-from pipeline.gap.survey.survey_views import TlsSurvey, measured_survey
+from pipeline.gap.survey.survey_views import Survey, measured_survey
 from pipeline.measurement.build import Request, build
 from scene.common.errors import InputError
 from scene.common.keyed_random import KeyedRandom
@@ -169,7 +169,7 @@ def test_a_place_from_which_too_little_is_seen_is_not_asked_for(pair: TlsMeasure
     def nothing(*_: Any) -> Any:
         raise InputError("240 of 358 points lie on smooth parts of the wall, 300 are needed", where="station")
 
-    monkeypatch.setattr(TlsSurvey, "moved", nothing)
+    monkeypatch.setattr(Survey, "moved", nothing)
     found = identifiability(measured_survey(pair, 600))
     names = [each.name for each in found.extensions]
     assert names[0] == "the scan repeated in the second face"

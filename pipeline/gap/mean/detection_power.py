@@ -22,7 +22,7 @@ import numpy as np
 from scipy.optimize import brentq
 from scipy.stats import ncx2
 
-from pipeline.gap.mean.candidates import Candidate
+from pipeline.gap.mean.candidates import Candidate, prior_precision
 from pipeline.gap.mean.design import NULL_DRAWS, Design
 from pipeline.gap.mean.nonparametric_terms import robust_extent
 from scene.common.keyed_random import KeyedRandom
@@ -65,40 +65,6 @@ class DetectableSize:
         """
         size = self.size if np.isfinite(self.size) else None
         return {"name": self.name, "parameter": self.parameter, "size": size, "at": dict(self.at), "note": self.note}
-
-
-@dataclass(frozen=True, eq=False)
-class Signature:
-    """One error whose smallest detectable size is to be computed, with the place of its design columns.
-
-    It belongs to one parameter of the error, or to a wave whose phase is free.
-
-    Attributes
-    ----------
-    candidate : The candidate error.
-    parameter : Name of the parameter whose detectable size is wanted.
-    columns : Numbers of the candidate's design columns among the examined columns that a `DetectionPower` holds.
-    sine : Whether the candidate has a phase; the phase that is hardest to detect is then taken.
-    needed : Function that returns the log-likelihood ratio that the error must reach to count as detected. Its argument is the
-        indices of the trial covariances of the reference surface's error, the most likely first.
-    """
-
-    candidate: Candidate
-    parameter: str
-    columns: list[int]
-    sine: bool
-    needed: Callable[[Sequence[int]], float]
-
-    def direction(self, information: FloatArray) -> FloatArray:
-        """Return the direction (k,), a unit vector of an error's k coefficients, along which its detectable size is computed.
-
-        It is the coefficient of the examined parameter alone; for a wave it is the phase that is hardest to detect.
-
-        information: (k, k) Fisher information of the k coefficients: how precisely the measurement determines them.
-        """
-        if self.sine:
-            return np.asarray(np.linalg.eigh(information)[1][:, 0])
-        return np.eye(len(information))[self.candidate.names.index(self.parameter)]
 
 
 def noncentrality(needed: float, columns: int) -> float:
@@ -178,24 +144,27 @@ class DetectionPower:
         alone = np.stack(constant) + 0.5 * np.einsum("cbd,cbd->cd", drawn[:, :count], fitted)
         return cls(likely, alone, drawn[:, count:] - cross @ fitted, own - cross @ beside, np.einsum("ckk->ck", own))
 
-    def size(self, signature: Signature) -> float:
+    def size(self, candidate: Candidate, parameter: str, rows: list[int], needed_at: Callable[[Sequence[int]], float]) -> float:
         """Return the size of an error that the measurement would have shown with a probability of 95 %.
 
-        An error of that size also raises the estimate of the reference surface's error, and with it the log-likelihood ratio that
-        counts as detected. The size is therefore computed a second time, with that larger estimate.
+        It is in the unit of the parameter, and infinite if the error would not show at any size. An error of that size also
+        raises the estimate of the reference surface's error, and with it the log-likelihood ratio that counts as detected. The
+        size is therefore computed a second time, with that larger estimate.
 
-        signature: the error, and the parameter whose size is wanted.
-
-        Returns
-        -------
-        The size in the unit of the parameter; infinite if the error would not show at any size.
+        Parameters
+        ----------
+        candidate : The candidate error.
+        parameter : The parameter whose size is wanted. If the error has a phase, the one that is hardest to detect is taken.
+        rows : Numbers of the candidate's columns among the examined ones.
+        needed_at : Function that returns the log-likelihood ratio that the error must reach to count as detected. Its argument is
+            the indices of the trial covariances of the reference surface's error, the most likely first.
         """
-        rows = signature.columns
-        precision = signature.candidate.prior_precision
         matrix, right = self.matrix[:, rows][:, :, rows], self.right[:, rows]
-        known = np.zeros(len(rows)) if precision is None else precision
-        information = matrix - np.diag(known)  # the normal equations contain the prior
-        along = signature.direction(information[self.likely])
+        information = matrix - np.diag(prior_precision(candidate, len(rows)))  # the normal equations contain the prior
+        if _PHASE in candidate.names:
+            along = np.asarray(np.linalg.eigh(information[self.likely])[1][:, 0])
+        else:
+            along = np.eye(len(rows))[candidate.names.index(parameter)]
         gained = information @ along
         squares = gained @ along
         if squares[self.likely] <= _NOTHING * float(along**2 @ self.whole[self.likely, rows]):
@@ -213,7 +182,7 @@ class DetectionPower:
 
         size = 0.0
         for _ in range(_ROUNDS):
-            needed = signature.needed(np.argsort(-without(size).mean(axis=1), kind="stable").tolist())
+            needed = needed_at(np.argsort(-without(size).mean(axis=1), kind="stable").tolist())
             start = np.sqrt(noncentrality(needed, len(rows)) / squares[self.likely])
             size = _first_reaching(start * _SIZES, reached, needed)
             if not np.isfinite(size):
@@ -278,9 +247,8 @@ def detectable_sizes(
     for each in [*plain, *(design.families.sines[number] for number in numbers)]:
         rows = list(range(start, start := start + (len(design.column_numbers[each]) if each.wave is None else 2)))
         name, at = (f"smooth error along {each.name}", {}) if each.empirical else (each.name, dict(each.fixed))
-        sine = _PHASE in each.names
-        for parameter in each.names[:1] if sine else each.names:
-            size = power.size(Signature(each, parameter, rows, sine, partial(needed, each)))
+        for parameter in each.names[:1] if _PHASE in each.names else each.names:
+            size = power.size(each, parameter, rows, partial(needed, each))
             key = name, "" if each.empirical else parameter
             found.setdefault(key, []).append(DetectableSize(*key, size, at))
     return [_of_variants(variants) for variants in found.values()]

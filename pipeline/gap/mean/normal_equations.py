@@ -8,7 +8,6 @@ becomes a fixed column first (`extend`).
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -192,7 +191,7 @@ def _squares(columns: FloatArray) -> FloatArray:
 
 
 def sine_products(grids: list[SineGrid], weighed: FloatArray, root: FloatArray) -> FloatArray:
-    """Compute the inner products of the columns of w trial sines with other columns, such as those of a selected effect.
+    """Compute the (2 w, k) products of the sine and cosine columns of w trial sines with k columns, such as those of an effect.
 
     With them, sinusoidal errors are scored beside that effect. Only the part within the cells of the wall is computed.
 
@@ -201,10 +200,6 @@ def sine_products(grids: list[SineGrid], weighed: FloatArray, root: FloatArray) 
     grids : Sines of unknown period, each with its trial frequencies; together w trial sines.
     weighed : (n, k) deviations of the other columns within cells at n points, times the inverse covariance of the noise.
     root : (n,) inverse standard deviations of the points.
-
-    Returns
-    -------
-    (2 w, k) products: sine and cosine column of each sine with each other column.
     """
     found = map_in_threads(lambda part: part.columns(root).T @ weighed, [part for grid in grids for part in grid.chunks])
     return np.concatenate(found) if found else np.zeros((0, weighed.shape[1]))
@@ -250,21 +245,14 @@ class NormalEquations:
             self, wave_fixed=np.concatenate([self.wave_fixed, products], axis=2), held_columns=(*self.held_columns, *columns)
         )
 
-    def at_covariances(self, chosen: list[int]) -> NormalEquations:
+    def at_covariances(self, chosen: list[int] | slice) -> NormalEquations:
         """Return the normal equations under only some of the trial covariances, such as the most likely ones, to save time.
 
-        chosen: indices into `covariances`, in the wanted order.
+        chosen: indices into `covariances`, in the wanted order, or a slice of them.
         """
-        return self._of([self.covariances[index] for index in chosen], chosen)
-
-    def _part(self, rows: slice) -> NormalEquations:
-        """Return the equations for consecutive covariances, given as a slice."""
-        return self._of(self.covariances[rows], rows)
-
-    def _of(self, at: list[CellCovariance], rows: Any) -> NormalEquations:
-        """Return the equations for some of the covariances: their indices are `rows`, and they are `at`."""
+        at = self.covariances[chosen] if isinstance(chosen, slice) else [self.covariances[index] for index in chosen]
         names = ("fixed", "right", "constant", "wave_fixed", "wave_own", "wave_right")
-        return replace(self, covariances=at, **{name: getattr(self, name)[rows] for name in names})
+        return replace(self, covariances=at, **{name: getattr(self, name)[chosen] for name in names})
 
     def log_likelihood(self, base: list[int]) -> FloatArray:
         """Return the (C, v) log-likelihoods of v columns of residuals under C trial covariances, with some columns fitted.
@@ -290,10 +278,8 @@ class NormalEquations:
 
         The profile log-likelihood is the maximum over the coefficients and over the C trial covariances.
 
-        Parameters
-        ----------
-        base : Numbers of the design columns of the base model, such as those of the pose; they must be in `held_columns`.
-        fixed : For each of f candidates with known columns, the numbers of its columns.
+        base: numbers of the design columns of the base model, such as those of the pose; they must be in `held_columns`. fixed:
+        for each of f candidates with known columns, the numbers of its columns.
 
         Returns
         -------
@@ -301,7 +287,7 @@ class NormalEquations:
         added : (f, v) log-likelihoods with each candidate added.
         waves : (w, v) log-likelihoods with each of the w trial sines added.
         """
-        parts = [self._part(slice(start, start + _AT_ONCE)) for start in range(0, len(self.covariances), _AT_ONCE)]
+        parts = [self.at_covariances(slice(start, start + _AT_ONCE)) for start in range(0, len(self.covariances), _AT_ONCE)]
         found = map_in_threads(lambda part: part._profile_chunk(base, fixed), parts)
         plain, added, waves = (np.max([each[kind] for each in found], axis=0) for kind in range(3))
         return plain, added, waves

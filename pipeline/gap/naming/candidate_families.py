@@ -50,18 +50,11 @@ def model_has(measurement: Measurement, name: str) -> bool:
 def catalogue_families(measurement: Measurement, part: Residuals) -> list[Candidate | SineGrid]:
     """List the systematic sensor errors of the catalogue to try as explanations of residuals, as regression terms.
 
-    Left out are errors that the sensor model already contains, and those that need data which were not recorded (intensity,
-    time). Each error gets a Gaussian prior of its size with mean 0, so that two similar errors cannot grow large and cancel.
+    Each has n design columns (change of the observable per unit of a parameter), or is a sine with a grid of trial frequencies.
+    Left out are errors that need data which were not recorded (intensity, time). Each error gets a Gaussian prior of its size
+    with mean 0, so that two similar errors cannot grow large and cancel.
 
-    Parameters
-    ----------
-    measurement : the measured points with the sensor model that is tested.
-    part : residuals of n of its points, measured minus predicted.
-
-    Returns
-    -------
-    list : each error with its n design columns (change of the observable per unit of a parameter); for an error that is a sine,
-        a grid of trial frequencies.
+    measurement: the measured points with the sensor model that is tested. part: residuals of n of its points.
     """
     return [_with_prior(each) for each in systematic_families(part, measurement)]
 
@@ -71,7 +64,7 @@ def candidate_families(
 ) -> list[Candidate | SineGrid]:
     """List all regression terms that a forward selection tries as explanations of the systematic part of residuals.
 
-    They are of three kinds: sensor errors of the catalogue that the sensor model lacks; terms along each covariate that name no
+    They are of three kinds: sensor errors of the catalogue; terms along each covariate that name no
     cause (line, spline, steps, waves), for errors that the catalogue lacks; and such terms along oblique directions on the wall.
     No sensor causes the last ones, so they show what an error of the reference surface can imitate.
 
@@ -80,11 +73,6 @@ def candidate_families(
     measurement : the measured points with the sensor model that is tested.
     part : residuals of n of its points, measured minus predicted.
     catalogue : the effects of the catalogue at these points (`catalogue_families`), if they are known already.
-
-    Returns
-    -------
-    list : each term with its design columns, n rows (change of the observable per unit of a coefficient); for a wave, a grid of
-        trial frequencies.
     """
     named = catalogue_families(measurement, part) if catalogue is None else catalogue
     lowest = {PERIODIC[each.name]: each.frequencies[0] for each in named if isinstance(each, SineGrid) and each.name in PERIODIC}

@@ -72,16 +72,14 @@ def screen_effects(measurement: Measurement, part: Residuals, candidates: Sequen
     measurement : the measured points with the sensor model that is tested.
     part : residuals of n of its points, measured minus predicted.
     candidates : effects as regression terms at these n points.
-    count : number of effects to return.
-
-    Returns
-    -------
-    list : the effects with plausible sizes, the one that leaves the smallest median absolute residual first.
+    count : number of effects to return: of those with plausible sizes, the ones that leave the smallest median absolute
+        residuals, the best one first.
     """
     rows = np.arange(0, len(part), max(len(part) // _FEWEST_POINTS, 1))
     few = part.part(rows)
     points, few = measurement.part(few.index), replace(few, index=np.arange(len(rows)))
-    screened = [(each, _ScreenedEffect.of_one_step(points, few, each.part(rows))) for each in candidates]
+    first_steps = (estimate_of_size(each, gauss_newton_step(few, [each])) for each in (each.part(rows) for each in candidates))
+    screened = zip(candidates, (_ScreenedEffect.of(points, few, estimate) for estimate in first_steps), strict=True)
     possible = [(each, fit) for each, fit in screened if fit is not None and np.isfinite(fit.noise_left)]
     found = []
     for candidate, fit in sorted(possible, key=lambda item: item[1].noise_left)[:count]:
@@ -115,11 +113,6 @@ class _ScreenedEffect:
         off = np.full(len(part), np.inf)
         off[np.isin(part.index, found.index)] = np.abs(value / found.sigma)[np.isin(found.index, part.index)]
         return cls(estimate, found, value, float(np.median(off)))
-
-    @classmethod
-    def of_one_step(cls, measurement: Measurement, part: Residuals, candidate: Candidate) -> _ScreenedEffect | None:
-        """Put an effect into the model of n points, at the size of one Gauss-Newton step; None if that is implausible."""
-        return cls.of(measurement, part, estimate_of_size(candidate, gauss_newton_step(part, [candidate])))
 
     def improved(self, measurement: Measurement, part: Residuals) -> _ScreenedEffect | None:
         """Change the size by a Gauss-Newton step, computed without the outliers; None if this does not reduce the noise left."""

@@ -144,24 +144,17 @@ class RegisteredModel:
 def simulate_errors(
     measurement: Measurement, model: TlsModel | StereoModel, residuals: Residuals, randoms: Sequence[KeyedRandom]
 ) -> FloatArray:
-    """Simulate the sensor's errors at measured points, to see which residuals a sensor model makes.
+    """Simulate the sensor's errors (d, n) at measured points, to see which residuals a sensor model makes.
 
-    An error is the simulated observable minus the one that geometry gives: range (m), disparity (px) or distance (m).
+    An error is the simulated observable minus the one that geometry gives: range (m), disparity (px) or distance (m). It is NaN
+    where a simulated pulse does not return.
 
     Parameters
     ----------
     measurement : the measured points, with the sensor at the pose to simulate from.
-    model : sensor model to simulate; that of the measurement is not used.
+    model : sensor model to simulate, of the same sensor; that of the measurement is not used.
     residuals : residuals of the n points, which tell where rays meet the reference; they may belong to another pose.
     randoms : d sources of random numbers, one for each simulation.
-
-    Returns
-    -------
-    FloatArray : (d, n) errors in the unit of the observable; NaN where a simulated pulse does not return.
-
-    Raises
-    ------
-    TypeError : measurement, model and residuals are of different sensors.
     """
     match measurement, model, residuals:
         case TlsMeasurement(), TlsModel(), TlsResiduals():
@@ -195,12 +188,9 @@ def measure_gap(
     residuals : residuals of the validation points, which no fit used.
     reference_sigma : standard deviation of the error of the reference surface, in the unit of the observable (m or px); such an
         error is added to every patch of a simulation.
-    most_sigmas : points farther than this many predicted standard deviations from both models are left out.
+    most_sigmas : points farther than this many predicted standard deviations from both models are left out. If too few remain,
+        None is returned.
     random : source of random numbers.
-
-    Returns
-    -------
-    Gap or None : the scores, and that of noise alone; None if too few points remain.
     """
     patch = wall_blocks_by_points(residuals.wall_xy, _POINTS_PER_PATCH)
     versions = [_draw_ensemble(measurement, version, residuals, random.child("ensemble")) for version in (before, after)]
@@ -248,11 +238,7 @@ def measure_losses(missing: ExpectedPulses, chance: FloatArray, held_out: BoolAr
     ----------
     missing : m pulses that should have hit the wall, and whether each returned.
     chance : (m,) probability of losing each pulse that the explanation predicts.
-    held_out : (m,) true for validation pulses, to which the explanation was not fitted.
-
-    Returns
-    -------
-    Gap or None : the scores; None for fewer than 100 validation pulses.
+    held_out : (m,) true for validation pulses, to which the explanation was not fitted. For fewer than 100, None is returned.
     """
     if held_out.sum() < 100:
         return None

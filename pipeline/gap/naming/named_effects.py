@@ -100,15 +100,13 @@ def with_effects(
 ) -> TlsModel | StereoModel:
     """Return a copy of a sensor model with further errors (effects) and other noise values, validated like a config file.
 
+    InputError is raised if a value is outside its bounds.
+
     Parameters
     ----------
     model : model to extend.
     entries : effects to append, each as an entry of a config: name and parameter values.
     noise : new values of the model's noise, by key such as `range_sigma_m`; None: unchanged.
-
-    Raises
-    ------
-    InputError : a value is outside its bounds.
     """
     values = model.model_dump(mode="json")
     changed = {"effects": [*values["effects"], *entries], "noise": {**values["noise"], **(noise or {})}}
@@ -129,10 +127,6 @@ def aligned_with(
     effects : effects to append to the model.
     registration_rows : rows of the measurement's points from which the pose is estimated; None: all.
     noise : new values of the model's noise, by key such as `range_sigma_m`; None: unchanged.
-
-    Returns
-    -------
-    AlignedMeasurement : the measurement at the estimated pose, its residuals, and the shift and rotation to that pose.
     """
     model = with_effects(measurement.model, [item.entry for item in effects], noise)
     return align(measurement.changed(model=model), registration_rows)
@@ -192,13 +186,8 @@ def effect_from_locking(found: Locking) -> NamedEffect:
     found: amplitude, period (px) and phase of the locking. It is a matching error that repeats with each pixel of the
     disparity.
     """
-    entry = {
-        "name": PixelLocking.tag(),
-        "amplitude_px": found.amplitude_px,
-        "period_px": found.period_px,
-        "phase_rad": found.phase_rad,
-        "tilt_rad": found.tilt_rad,
-    }
+    keys = ("amplitude_px", "period_px", "phase_rad", "tilt_rad")
+    entry = {"name": PixelLocking.tag(), **{key: getattr(found, key) for key in keys}}
     return _named("stereo", entry, {"amplitude_px": found.std_px}, found.gain)
 
 
@@ -251,11 +240,8 @@ def effect_from_tails(part: Residuals, sigma: float, gain: float) -> NamedEffect
 def effect_from_losses(found: LossExplanation, intensity: FloatArray | None) -> NamedEffect:
     """Convert an explanation of missing laser returns, such as a detection limit, to a named effect, as an entry of gap.json.
 
-    Parameters
-    ----------
-    found : the explanation, with its parameters and their standard deviations.
-    intensity : (n,) received powers of the recorded points. The detection limit is taken from the weakest ones. None if no
-        powers were recorded.
+    found: the explanation, with its parameters and their standard deviations. intensity: (n,) received powers of the recorded
+    points, from the weakest of which the detection limit is taken; None if no powers were recorded.
     """
     parameters, std = dict(found.parameters), dict(found.std)
     if found.name == DetectionLimit.tag() and intensity is not None:
@@ -356,17 +342,14 @@ def merge_angle_curves(
     """Add up error curves of a scanner's angle that two successive selections found, so that each is reported once.
 
     A curve gives the error (rad) of an angle along a covariate. The second selection has the curves of the first one in its
-    model. What it finds for the same angle and covariate is therefore a correction of them.
+    model. What it finds for the same angle and covariate is therefore a correction of them. The first curves are returned with
+    their corrections added, and the later curves that belong to none of them.
 
     Parameters
     ----------
     angles : curves of the first selection.
     later : curves that the second selection found in addition.
     part : residuals, with the covariates of their points, over whose range the curves are added.
-
-    Returns
-    -------
-    tuple : the first curves with their corrections added, and the later curves that belong to none of them.
     """
     joined, others = [], list(later)
     for term in angles:

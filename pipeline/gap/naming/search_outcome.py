@@ -68,10 +68,7 @@ class SearchOutcome:
 
     @property
     def complexity(self) -> tuple[int, int]:
-        """Number of empirical terms in this explanation of residuals, then number of all effects, to prefer the simplest one.
-
-        Pairs are compared in this order; empirical terms name no cause.
-        """
+        """Number of empirical terms in this explanation of residuals, then number of all effects, to prefer the simplest one."""
         return sum(each.candidate.empirical for each in self.estimates), len(self.estimates)
 
     @property
@@ -81,11 +78,8 @@ class SearchOutcome:
 
     def leaves_more_misfit_than(self, other: SearchOutcome) -> bool:
         """Tell whether this explanation leaves a misfit, so that it may lack an effect, where another one leaves none."""
-
-        def leaves_misfit(p_value: float | None) -> bool:
-            return p_value is not None and p_value <= thresholds().verdict.rejection_p
-
-        return leaves_misfit(self.p_value) and not leaves_misfit(other.p_value)
+        mine, theirs = (each.p_value is not None and each.p_value <= thresholds().verdict.rejection_p for each in (self, other))
+        return mine and not theirs
 
     def with_classes_of(self, linear: SearchOutcome) -> SearchOutcome:
         """Add to the class of each effect what a linearised search could not tell from it, unless this explanation clearly can.

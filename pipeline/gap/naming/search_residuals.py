@@ -15,10 +15,7 @@ from sensors.effects.matching_noise import MatchingNoise
 def with_added_variance(part: Residuals, variance: float) -> Residuals:
     """Return a copy of residuals with more predicted noise, to account for an error found before, such as rounded ranges.
 
-    Parameters
-    ----------
-    part : residuals with their predicted standard deviations.
-    variance : variance to add at every point, squared unit of the observable (m² or px²).
+    variance: variance to add at every point, squared unit of the observable (m² or px²).
     """
     return replace(part, sigma=np.sqrt(part.sigma**2 + variance)) if variance else part
 

@@ -30,10 +30,7 @@ def notes_on_outcome(found: SearchOutcome, part: Residuals) -> list[str]:
     They tell of terms that repeat after a few scan lines, of waves that belong to the reference, and of the candidate that is
     most similar to a misfit where nothing was accepted.
 
-    Parameters
-    ----------
-    found : the explanation.
-    part : the residuals of the n points that were searched.
+    found: the explanation. part: the residuals of the n points that were searched.
     """
     return [*_note_repetition(found.estimates), *_note_oblique_waves(found), *_note_most_similar(found, part)]
 

@@ -96,8 +96,7 @@ class PassInput:
         plain : its residuals without edge effects.
         held_out_points : (N,) true for points that are kept for validation.
         edge_effects : edge effects to put into the model. Their attribute `touched` must have a value for each of the N points.
-        large_effect : an error so large that without it much of the rock would count as changed. It is in the model while
-            changes and outliers are found, and not in the residuals.
+        large_effect : see the attribute.
         """
         touched = np.any([np.zeros(len(plain), dtype=bool), *(each.touched[plain.index] for each in edge_effects)], axis=0)
         registration_rows = plain.index[~(touched | held_out_points[plain.index])]
@@ -185,10 +184,9 @@ class SelectionPass:
         random : source of random numbers for the null distributions.
         excluded : effects that are not tried, as pairs (name, whether it is an empirical term).
         """
-        given = pass_input
-        noise = None if given.large_effect is None else given.registered_residuals[given.training_rows]
-        selected = select_effects(SelectionInput(*given.training_part, given.noise_ratio, random, excluded, noise))
-        return cls(given, *selected)
+        noise = None if pass_input.large_effect is None else pass_input.registered_residuals[pass_input.training_rows]
+        given = SelectionInput(*pass_input.training_part, pass_input.noise_ratio, random, excluded, noise)
+        return cls(pass_input, *select_effects(given))
 
 
 def _names(effects: list[EdgeEffect]) -> set[str]:
@@ -198,10 +196,9 @@ def _names(effects: list[EdgeEffect]) -> set[str]:
 
 @dataclass(frozen=True, eq=False)
 class PassInputs:
-    """Prepares the input of a search for sensor errors, with any choice of edge effects in the sensor model.
+    """Prepares the input of a search for sensor errors, with any choice of edge effects (`PassInput`) in the sensor model.
 
-    Edge effects are errors at depth steps: edge fattening, smoothing, filled occlusions and the beam footprint. Other errors
-    can hide or imitate them, so they are searched again beside the errors that a search has named.
+    Other errors can hide or imitate edge effects, so these are searched again beside the errors that a search has named.
 
     Attributes
     ----------
@@ -346,14 +343,10 @@ def _with_effects(
     touched: BoolArray,
     registration_rows: NDArray[np.int64],
 ) -> tuple[Measurement, Residuals, BoolArray]:
-    """Put effects into the model, as entries of a config.
+    """Put effects into the model, as entries of a config, and estimate the pose again from `registration_rows` of the points.
 
-    The pose is estimated again from `registration_rows`, rows of the measurement's points. touched: (n,) points
-    that the effects move, which then may not be used.
-
-    Returns
-    -------
-    The measurement, the residuals of the same n points, and (n,) true for those that see smooth surface with the effects.
+    It returns the measurement, the residuals of the same n points, and (n,) true for those that see smooth surface with the
+    effects. touched: (n,) points that the effects move, which then may not be used.
     """
     if not entries:
         return measurement, residuals, residuals.on_smooth_surface

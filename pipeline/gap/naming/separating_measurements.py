@@ -21,16 +21,10 @@ def with_separating_measurements(measurement: Measurement, named: list[NamedEffe
     """Say for each named effect (sensor error) that has alternatives which further measurement would tell it from them.
 
     Several additional measurements, such as a second station, are tried by computation. One tells two effects apart if it makes
-    their signatures (the patterns of residuals that they make) clearly different.
+    their signatures (the patterns of residuals that they make) clearly different. The attribute `split_by` of the returned
+    effects names it.
 
-    Parameters
-    ----------
-    measurement : measurement as it was taken.
-    named : named effects; each lists the effects from which this measurement cannot tell it.
-
-    Returns
-    -------
-    list : the effects, with the further measurement in the attribute `split_by` of each that has alternatives.
+    measurement: measurement as it was taken. named: effects; each lists those from which this measurement cannot tell it.
     """
     if not any(item.indistinguishable for item in named):
         return named
@@ -43,10 +37,7 @@ def measurement_separating_noises(item: NamedEffect, sensor: str) -> str:
 
     The answer follows from the quantities, such as range or intensity, on which each noise depends.
 
-    Parameters
-    ----------
-    item : a named noise effect, with the effects that it cannot be told from.
-    sensor : "tls" or "stereo".
+    item: a named noise effect, with the effects that it cannot be told from. sensor: "tls" or "stereo".
     """
     told = (effect_of(name).told_by for name in (item.name, *item.indistinguishable))
     return " or ".join(filter(None, told)) or _IN_GENERAL[sensor]
@@ -61,7 +52,7 @@ def _separating_measurement(found: Identifiability, item: NamedEffect) -> str:
         return _IN_GENERAL[found.sensor]  # effects on returns and edge effects have no signature in the mean
     own = found.names.index(item.name)
     cosine = {each.name: max(float(each.cosines[own, other]) for other in known) for each in found.extensions}
-    best = min(cosine, key=lambda name: cosine[name])
+    best, *others = sorted(cosine, key=lambda name: cosine[name])
     if cosine[best] < SIMILAR_COSINE:
-        return " or ".join(name for name in sorted(cosine, key=lambda name: cosine[name]) if cosine[name] < SIMILAR_COSINE)
+        return " or ".join([best, *(name for name in others if cosine[name] < SIMILAR_COSINE)])
     return f"no single further measurement; the best is {best} (signatures still alike: cosine {cosine[best]:.2f})"

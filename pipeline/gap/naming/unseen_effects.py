@@ -37,15 +37,9 @@ def unseen_effects(residuals: Residuals, computed: Iterable[DetectableSize], nam
     """
     effects = {effect.tag(): effect for effect in residuals.candidates if not effect.empirical and effect.tag() not in named}
     kept = [each for each in computed if each.name not in named]
-    known = {each.name for each in kept}
-    return (
-        *(_plausible(each, effects.get(each.name)) for each in kept),
-        *(
-            DetectableSize(name, "", np.nan, note=_reason(effect, residuals))
-            for name, effect in effects.items()
-            if name not in known
-        ),
-    )
+    others = {name: effect for name, effect in effects.items() if name not in {each.name for each in kept}}
+    unknown = (DetectableSize(name, "", np.nan, note=_reason(effect, residuals)) for name, effect in others.items())
+    return (*(_plausible(each, effects.get(each.name)) for each in kept), *unknown)
 
 
 def _plausible(item: DetectableSize, effect: type[Effect] | None) -> DetectableSize:

@@ -36,9 +36,7 @@ class ValidationResult:
     model : the model.
     value : (n,) residuals against it after registration, in the unit of the observable (m or px); NaN where a ray misses the
         reference.
-    pose : (6 k,) pose of that registration: shift (m) and small rotation (rad) of each of k set-ups from the pose in the
-        measurement, wall frame. For a surface without cameras: (q,) amounts of those combinations of shift, rotation and
-        scale that its points determine, as the attribute `datum` of its residuals defines them.
+    pose : pose of that registration, in the form of `RegisteredModel.pose`.
     gap : scores of the model without and with the effects; None if too few points can be scored.
     """
 
@@ -98,7 +96,7 @@ class Validation:
 
     @property
     def pose(self) -> FloatArray:
-        """Pose that registers the measurement to the model without named effects, in the form of `ValidationResult.pose`."""
+        """Pose that registers the measurement to the model without named effects, in the form of `RegisteredModel.pose`."""
         return fit_pose(self.residuals, self.registration_rows)
 
     def validate(self, named: list[NamedEffect]) -> tuple[ValidationResult, list[str]]:

@@ -38,7 +38,9 @@ class ValidatedEffects:
     ----------
     named : effects that improve the predictions; the gain of each is its log-likelihood ratio on these parts.
     failed : effects that do not improve them.
-    weak : effects that improve them, but by too little or in too few of the parts to be reported by name.
+    weak : effects that improve them, but too little to be named beside others: by no more than `variance.least_gain`, in too few
+        wall blocks (`verdict.block_p`), with a size within its uncertainty of zero, or, for an empirical term, by less than the
+        share `mean.class_share` of what the strongest effect gains.
     """
 
     named: list[NamedEffect]
@@ -86,13 +88,6 @@ def validate_effects(
     training : (n,) true for points from which the pose is estimated; the other points, the validation points, are scored.
     reference_sigma : standard deviation of the error of the reference surface, in the unit of the observable (m or px).
     blocks : the large squares of the wall (wall blocks), each of which is used as a whole for fits or for validation.
-
-    Returns
-    -------
-    ValidatedEffects : accepted effects; failed ones, which do not improve the likelihood; and weak ones, which improve it, but
-        too little to be named beside others: by no more than `variance.least_gain`, in too few wall blocks (`verdict.block_p`),
-        the effect's size is within its uncertainty of zero, or an empirical term gains less than the share `mean.class_share` of
-        what the strongest effect gains.
     """
     scorable = [item for item in named if item.effect.scored()]
     if not scorable or (~training).sum() < 100:
@@ -128,20 +123,16 @@ def validate_effects(
 
 
 def _groups(effects: Sequence[NamedEffect]) -> list[tuple[NamedEffect, ...]]:
-    """Groups of systematic effects that may compensate each other: all, all but the strongest ones, and each two of them.
-
-    effects: the strongest first.
-    """
+    """Groups of effects (the strongest first) that may compensate each other: all but the strongest ones, and pairs."""
     nested = [tuple(effects[start:]) for start in range(len(effects) - 2)]
     return [*nested, *combinations(effects, 2)]
 
 
 def _is_weak(item: NamedEffect, gains: FloatArray | None, most: float) -> bool:
-    """Whether an effect beside others gains too little, or in too few wall blocks, to be named, or may be of size zero.
+    """Whether an effect is weak beside others (see `ValidatedEffects`). most: what the strongest effect gains.
 
-    An empirical term must gain more than the inexact part (`mean.class_share`) of the effect of the catalogue that gains most,
-    because it may describe no more than that. most: what that effect gains. Noise and lost returns do not count: they move no
-    point, so their form cannot be mistaken for a curve.
+    An empirical term may describe no more than the inexact part of that effect. Noise and lost returns do not count as the
+    strongest effect: they move no point, so their form cannot be mistaken for a curve.
     """
     if gains is None:
         return False
@@ -165,11 +156,7 @@ def blocks_agree(gains: FloatArray) -> bool:
 
 
 def describe_weakness(item: NamedEffect) -> str:
-    """Say in the report why an effect (sensor error) is mentioned but not named, although it improves the predictions.
-
-    item: an effect whose size is consistent with zero, whose log-likelihood ratio on validation blocks is too small, or on which
-        these blocks do not agree; or an empirical term that gains next to nothing beside another effect.
-    """
+    """Say in the report why a weak effect (see `ValidatedEffects`) is not named although it improves the predictions."""
     gain = f"{item.gain:.1f} in log-likelihood on validation blocks"
     if item.kind != "physical":
         share = f"{100 * thresholds().mean.class_share:g} %"
@@ -270,10 +257,7 @@ def _inliers(found: _RegisteredResiduals) -> BoolArray:
 def _registered_residuals(
     measurement: Measurement, named: list[NamedEffect], residuals: Residuals, training: BoolArray
 ) -> _RegisteredResiduals:
-    """Return the residuals of all points with some effects in the model.
-
-    The pose is estimated from the training points. Residuals are NaN where the surface is not smooth.
-    """
+    """Residuals of all points with effects in the model, the pose from the training points; NaN where it is not smooth."""
     found = aligned_with(measurement, named, residuals.index[training]).residuals
     count = len(measurement.cloud.points)
     place = np.full(count, -1)

@@ -137,10 +137,7 @@ class Evidence:
         return gap.before - gap.after + by.gap_sigmas * gap.error < by.least_closed * (gap.before - gap.floor)
 
     def only_noise_too_large(self, named: Sequence[NamedEffect]) -> bool:
-        """Tell whether the only fault of the sensor model is that its noise is too large, so that lower noise can be proposed.
-
-        named: sensor errors that the diagnosis names; if there are any, the answer is false.
-        """
+        """Tell whether the only fault of the sensor model is that its noise is too large: also, no sensor errors are `named`."""
         still_open = self.gap is not None and self.gap.left_open and not self.model_is_accepted
         return self.noise_ratio < 1.0 and not (
             named or self.misfit_is_significant or self.outlier_share or self.is_overdispersed or still_open
@@ -150,16 +147,10 @@ class Evidence:
 def verdict_of(named: Sequence[NamedEffect], evidence: Evidence) -> str:
     """Decide the verdict of a diagnosis: whether the sensor model agrees with the measurement, and if not, what explains it.
 
-    Parameters
-    ----------
-    named : sensor errors (effects) that the diagnosis names.
-    evidence : scores and p-values that decide.
+    It is "no_gap" if they agree; "named" or "several" if one or more effects explain the misfit; "ambiguous" if the one effect
+    cannot be told from others; "unknown" if no effect of the catalogue explains it; "insufficient_data" if nothing can be said.
 
-    Returns
-    -------
-    str : "no_gap" if they agree; "named" or "several" if one or more effects explain the misfit; "ambiguous" if the one effect
-        cannot be told from others; "unknown" if no effect of the catalogue explains it; "insufficient_data" if nothing can be
-        said.
+    named: sensor errors (effects) that the diagnosis names. evidence: scores and p-values that decide.
     """
     if evidence.much_moved:
         return "insufficient_data"

@@ -65,7 +65,7 @@ class _EdgeData:
     Attributes
     ----------
     residuals : residuals without edge effects.
-    raster : raster of the measured disparities.
+    whole, raster : raster of the measured disparities, and the part of it that is searched.
     registered_residuals : (n,) residuals after a robust pose fit, px.
     sigma : (n,) their standard deviations, px.
     held_out : (n,) points that must not be used.
@@ -73,6 +73,7 @@ class _EdgeData:
     """
 
     residuals: StereoResiduals
+    whole: DisparityRaster
     raster: DisparityRaster
     registered_residuals: FloatArray
     sigma: FloatArray
@@ -81,22 +82,20 @@ class _EdgeData:
 
     @classmethod
     def of(
-        cls,
-        measurement: StereoMeasurement,
-        raster: DisparityRaster,
-        residuals: StereoResiduals,
-        registered_residuals: FloatArray,
-        held_out: BoolArray,
-    ) -> _EdgeData:
-        """Gather what a search needs; of a large raster only a part of the points is kept."""
+        cls, measurement: StereoMeasurement, residuals: StereoResiduals, registered_residuals: FloatArray, held_out: BoolArray
+    ) -> _EdgeData | None:
+        """Gather what a search needs, of a large raster from a part of the points; None if the points lie on no pixel raster."""
+        whole = DisparityRaster.of(measurement, residuals.geometry)
+        if whole is None:
+            return None
         scale = nmad((registered_residuals / residuals.sigma)[residuals.usable], 0.0)
         known: list[Effect] = [*measurement.model.effects]
-        known_shift = raster.added_by(known, residuals.geometry.disparity)
-        search_raster, points = raster.search_part()
+        known_shift = whole.added_by(known, residuals.geometry.disparity)
+        raster, points = whole.search_part()
         part = residuals.part(points)
         part = replace(part, value=part.value + known_shift[points])
         registered = (registered_residuals + known_shift)[points]
-        return cls(part, search_raster, registered, scale * part.sigma, held_out[points], known)
+        return cls(part, whole, raster, registered, scale * part.sigma, held_out[points], known)
 
     def for_trials(self) -> _EdgeData:
         """Return the data at evenly spaced ones of many points, at which values of an effect's parameters are tried."""
@@ -206,16 +205,15 @@ def find_disparity_edge_effects(
     -------
     list : significant effects that the sensor model lacks; empty if the points lie on no pixel raster.
     """
-    raster = DisparityRaster.of(measurement, residuals.geometry)
-    if raster is None:
+    data = _EdgeData.of(measurement, residuals, registered_residuals, held_out)
+    if data is None:
         return []
-    data = _EdgeData.of(measurement, raster, residuals, registered_residuals, held_out)
     found = _search(data)
     if len(data.sigma) == len(registered_residuals):
         return found
     before = ([*data.beside, *(each.effect for each in found[:count])] for count in range(len(found)))
     return [
-        replace(each, touched=_unpredictable_points(each.effect, others, raster, residuals))
+        replace(each, touched=_unpredictable_points(each.effect, others, data.whole, residuals))
         for each, others in zip(found, before, strict=True)
     ]
 
@@ -287,11 +285,8 @@ def _gather_trusted(measurement: Measurement, residuals: Residuals, trusted: NDA
     """Gather what a search needs, from trusted points alone; None if the points lie on no pixel raster."""
     if not isinstance(measurement, StereoMeasurement) or not isinstance(residuals, StereoResiduals):
         return None
-    raster = DisparityRaster.of(measurement, residuals.geometry)
-    if raster is None:
-        return None
     held_out = ~np.isin(residuals.index, trusted)
-    return _EdgeData.of(measurement, raster, residuals, fit_pose_robustly(residuals)[0], held_out)
+    return _EdgeData.of(measurement, residuals, fit_pose_robustly(residuals)[0], held_out)
 
 
 def _log_likelihood_with_edge_effects(data: _EdgeData | None, count: int) -> float:
@@ -430,7 +425,7 @@ def _find_smoothing(data: _EdgeData) -> EdgeEffect | None:
 def _find_filling(data: _EdgeData) -> EdgeEffect | None:
     """Find filled occlusions: points where the right camera sees nothing, at the disparity of the background beside them.
 
-    Without the effect few of those cells hold a point, at most a fifth, where edges are not exactly where the reference has them.
+    Without the effect at most a fifth of those cells hold a point, where edges are not exactly where the reference has them.
     """
     raster = data.raster
     points = raster.in_filled_occlusions(data.beside)

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from pipeline.change.robust import nmad
 from pipeline.gap.noise_and_edges.variance_model import VarianceTerm
-from pipeline.gap.residuals.disparity_raster import raster_spacing_px
+from pipeline.gap.residuals.disparity_raster import cell_numbers, raster_spacing_px
 from pipeline.gap.residuals.residuals import BoolArray
 from pipeline.gap.residuals.stereo_residuals import StereoResiduals
 from pipeline.gap.residuals.wall_blocks import wall_blocks_by_points
@@ -281,7 +281,7 @@ def _variogram(part: StereoResiduals, value: FloatArray, model: StereoModel) -> 
     steps = [step for step in (raster_spacing_px(g.v), raster_spacing_px(g.u)) if step is not None]
     if len(steps) < 2:
         return None
-    row, column = (np.rint((x - x.min()) / step).astype(np.int64) for x, step in zip((g.v, g.u), steps, strict=True))
+    row, column = cell_numbers(g.v, steps[0]), cell_numbers(g.u, steps[1])
     bound = _CLIP * nmad(value)
     raster = np.full((int(row.max()) + 1, int(column.max()) + 1), np.nan)
     raster[row, column] = np.where(np.abs(value) < bound, value, np.nan)

@@ -27,8 +27,7 @@ _STRIPS = 8
 """Strips across a sector whose losses must agree."""
 _DIRECTIONS = {"azimuth": "zenith", "zenith": "azimuth"}
 """Angles on which losses may depend without an effect of the catalogue, and the angle across each. Range, incidence and
-    power are explained by the catalogue.
-    """
+power are explained by the catalogue."""
 _BINS = 16
 _MOST_PULSES = 20_000
 """Pulses that decide where the search for the best values starts."""

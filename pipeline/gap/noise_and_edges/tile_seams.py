@@ -17,7 +17,7 @@ from scipy.stats import norm, rankdata
 
 from pipeline.change.robust import nmad
 from pipeline.gap.mean.detection_power import POWER, DetectableSize
-from pipeline.gap.residuals.disparity_raster import raster_cell_px
+from pipeline.gap.residuals.disparity_raster import cell_numbers, raster_cell_px
 from pipeline.gap.residuals.residuals import BoolArray
 from pipeline.gap.residuals.stereo_residuals import StereoResiduals
 from pipeline.gap.thresholds import thresholds
@@ -145,7 +145,8 @@ class _SeamTest:
         step = raster_cell_px(at.u, at.v)
         if step is None:
             return None
-        (u, column), (v, row) = (_axis(x, step) for x in (at.u, at.v))
+        column, row = cell_numbers(at.u, step), cell_numbers(at.v, step)
+        u, v = (x.min() + step * np.arange(number.max() + 1) for x, number in ((at.u, column), (at.v, row)))
         raster = np.full((len(v), len(u)), np.nan)
         raster[row, column] = registered_residuals
         axes = _SeamDifferences.of(u, v, raster), _SeamDifferences.of(v, u, raster.T)
@@ -299,13 +300,6 @@ def _seam_score(axes: tuple[_SeamDifferences, _SeamDifferences], side: float) ->
     scores = np.concatenate(of_axes)
     enough = len(scores) >= _FEWEST_SEAMS and all(each.sum() > _LEAST_AXIS_SIGMAS * np.sqrt(len(each)) for each in of_axes)
     return float(scores.sum() / np.sqrt(len(scores))) if enough else 0.0
-
-
-def _axis(x: FloatArray, step: float) -> tuple[FloatArray, NDArray[np.int64]]:
-    """Coordinates of the raster's columns (or rows), px, and the (n,) index of each point's."""
-    low = float(x.min())
-    index = np.rint((x - low) / step).astype(np.int64)
-    return low + step * np.arange(index.max() + 1), index
 
 
 def _sides(last: float, step: float) -> FloatArray:

@@ -92,8 +92,8 @@ def sigma_after(found: GapDiagnosis) -> FloatArray:
     match found.model_after, found.residuals:
         case TlsModel() as model, TlsResiduals(geometry=rays) as ranges:
             return np.asarray(np.sqrt(model.variance(rays) + ranges.reference_variance))
-        case StereoModel() as model, SurfaceResiduals() as surface:
-            return predicted_sigma(model, surface)
+        case StereoModel() as model, SurfaceResiduals(geometry=places):
+            return predicted_sigma(model, places)
         case StereoModel() as model, residuals:
             return np.asarray(np.sqrt(np.broadcast_to(model.variance, len(residuals))))
     raise TypeError("model and residuals are of different sensors")

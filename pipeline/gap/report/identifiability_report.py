@@ -22,7 +22,6 @@ from pipeline.report.provenance import versions
 _INSTRUMENTS = {"stereo": "Stereo pair", "tls": "Laser scanner"}
 _WORTHWHILE_RATIO = 0.8
 """An additional measurement is shown if it lowers the size from which an effect can be named to this share."""
-_NEVER = "never"
 
 
 def write_identifiability(out: Path, found: Sequence[Identifiability]) -> Path:
@@ -117,4 +116,4 @@ def _row(found: Identifiability, row: int) -> dict[str, str]:
 
 def _format_value(parameter: str, value: float) -> str:
     """Format a parameter's value; "never" where it is infinite."""
-    return f"{parameter} {format_number(value, 2) if np.isfinite(value) else _NEVER}".strip()
+    return f"{parameter} {format_number(value, 2) if np.isfinite(value) else 'never'}".strip()

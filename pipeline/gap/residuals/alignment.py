@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from pipeline.change.robust import nmad
 from pipeline.formats.measurements.measurement import Measurement, StereoMeasurement, SurfaceMeasurement
-from pipeline.gap.residuals.residuals import BoolArray, Residuals, Rows
+from pipeline.gap.residuals.residuals import BoolArray, Residuals
 from pipeline.gap.residuals.several_scans import residuals_of_scans
 from pipeline.gap.residuals.stereo_residuals import stereo_residuals
 from pipeline.gap.residuals.surface_residuals import SurfaceResiduals, surface_residuals
@@ -41,8 +41,6 @@ change as it moves.
 
 def fit_pose_robustly(residuals: Residuals) -> tuple[FloatArray, FloatArray, float]:
     """Fit the pose of the sensor to the residuals by least squares, rejecting outliers in several rounds.
-
-    The surveyed pose is never exact. Its error must be removed before errors of the sensor are searched for in the residuals.
 
     Parameters
     ----------
@@ -85,7 +83,7 @@ class RobustPoseFit:
 
     @classmethod
     def of(cls, residuals: Residuals) -> RobustPoseFit:
-        """Prepare the fit of the pose to usable points. residuals: of n points; their values do not matter."""
+        """Prepare the fit of the pose to the usable points of `residuals`; their values do not matter."""
         rows = np.flatnonzero(residuals.usable)
         columns = np.take(residuals.pose_jacobian, rows, axis=0)
         columns /= residuals.sigma[rows, None]
@@ -124,33 +122,13 @@ class RobustPoseFit:
 
 
 def fit_pose(residuals: Residuals, rows: BoolArray | NDArray[np.int64]) -> FloatArray:
-    """Fit the pose of the sensor to the residuals of chosen points by weighted least squares.
+    """Fit the pose of the sensor to the residuals of points that are known to be good, by weighted least squares.
 
-    Outliers are not rejected; use it where the points are known to be good.
-
-    Parameters
-    ----------
-    residuals : Residuals of n points, with their predicted standard deviations and their derivatives by the pose.
-    rows : The points to use, as a mask (n,) or as row numbers.
-
-    Returns
-    -------
-    (6 k,) correction of the pose of each of k set-ups (positions of the sensor): shift (m) and small rotation (rad), wall
-    frame. For a cloud without cameras: one value for each column of `residuals.pose_jacobian`.
+    rows: the points to use, as a mask (n,) or as row numbers. Returns the correction of the pose (6 k,), as
+    `fit_pose_robustly` does, but rejects no outliers.
     """
-    return _least_squares(_weighted_design(residuals, rows))
-
-
-def _weighted_design(residuals: Residuals, rows: Rows = slice(None)) -> FloatArray:
-    """(m, 6 k + 1) pose Jacobian and, as last column, the residuals of some rows, both divided by sigma."""
-    design = np.empty((len(residuals.sigma[rows]), residuals.pose_jacobian.shape[1] + 1))
-    design[:, :-1], design[:, -1] = residuals.pose_jacobian[rows], residuals.value[rows]
+    design = np.column_stack([residuals.pose_jacobian[rows], residuals.value[rows]])
     design /= residuals.sigma[rows, None]
-    return design
-
-
-def _least_squares(design: FloatArray) -> FloatArray:
-    """(6 k,) least-squares coefficients of the first 6 k columns of `design` (n, 6 k + 1) for its last column."""
     triangle = _triangular_factor(design)
     return np.asarray(np.linalg.lstsq(triangle[:, :-1], triangle[:, -1], rcond=np.finfo(float).eps * len(design))[0])
 
@@ -160,35 +138,10 @@ def _triangular_factor(design: FloatArray) -> FloatArray:
     while len(design) > _AT_ONCE:
         whole = len(design) // _AT_ONCE * _AT_ONCE
         blocks = design[:whole].reshape(-1, _AT_ONCE, design.shape[1])
-        triangles = map_in_threads(_qr_factors, [blocks[start : start + _BLOCKS] for start in range(0, len(blocks), _BLOCKS)])
-        design = np.concatenate([*triangles, design[whole:]])
+        groups = [blocks[start : start + _BLOCKS] for start in range(0, len(blocks), _BLOCKS)]
+        triangles = map_in_threads(lambda group: np.asarray(np.linalg.qr(group, mode="r")), groups)
+        design = np.concatenate([*(each.reshape(-1, design.shape[1]) for each in triangles), design[whole:]])
     return np.asarray(np.linalg.qr(design, mode="r"))
-
-
-def _qr_factors(blocks: FloatArray) -> FloatArray:
-    """(b k, k) the triangular QR factors of b groups of rows (b, m, k)."""
-    return np.asarray(np.linalg.qr(blocks, mode="r")).reshape(-1, blocks.shape[2])
-
-
-def compute_raw_residuals(measurement: Measurement) -> Residuals:
-    """Compute residuals (measured minus predicted observable) with the sensor at the pose that the measurement states.
-
-    Unlike `compute_residuals`, it fits no pose to single epochs (repetitions of the measurement).
-
-    Parameters
-    ----------
-    measurement : One laser scan or several, a stereo pair, or a point cloud from photographs without its cameras. It contains
-        the reference surface and the sensor model, by which the observables are predicted.
-
-    Returns
-    -------
-    Residuals of ranges (m), of disparities (px), or of distances from the reference surface (m), by the kind of measurement.
-    """
-    if isinstance(measurement, SurfaceMeasurement):
-        return surface_residuals(measurement)
-    if isinstance(measurement, StereoMeasurement):
-        return stereo_residuals(measurement)
-    return residuals_of_scans(measurement) if measurement.scans else tls_residuals(measurement)
 
 
 def compute_residuals(measurement: Measurement) -> Residuals:
@@ -200,13 +153,20 @@ def compute_residuals(measurement: Measurement) -> Residuals:
     Parameters
     ----------
     measurement : One laser scan or several, a stereo pair or a cloud without cameras. It contains the reference surface and the
-        sensor model.
+        sensor model, by which the observables are predicted.
 
     Returns
     -------
-    Residuals of all points that can be compared with the reference.
+    Residuals of all points that can be compared with the reference: of ranges (m), of disparities (px), or of distances from the
+    reference surface (m).
     """
-    found = compute_raw_residuals(measurement)
+    found: Residuals
+    if isinstance(measurement, SurfaceMeasurement):
+        found = surface_residuals(measurement)
+    elif isinstance(measurement, StereoMeasurement):
+        found = stereo_residuals(measurement)
+    else:
+        found = residuals_of_scans(measurement) if measurement.scans else tls_residuals(measurement)
     epochs = measurement.epochs[found.index]
     numbers = np.unique(epochs)
     if len(numbers) < 2:
@@ -223,9 +183,9 @@ class AlignedMeasurement(NamedTuple):
     Attributes
     ----------
     measurement : The measurement with the sensor at this pose.
-    residuals : Its residuals (measured minus predicted observable) at this pose.
-    pose : (6 k,) by how much each of k set-ups (positions of the sensor) was moved from its surveyed pose: shift (m) and small
-        rotation (rad), wall frame. For a cloud without cameras: one value for each column of `residuals.pose_jacobian`.
+    residuals : Its residuals at this pose.
+    pose : (6 k,) by how much each of k set-ups (positions of the sensor) was moved from its surveyed pose, as
+        `fit_pose_robustly` returns it.
     """
 
     measurement: Measurement
@@ -257,7 +217,8 @@ def align(
     total = np.zeros(found.pose_jacobian.shape[1])
     most = _MOST_MOVES_OF_SURFACES if isinstance(measurement, SurfaceMeasurement) else _MOST_MOVES
     for _ in range(most if len(found) else 0):
-        pose = fit_pose_robustly(_restricted_to(found, trusted))[1]
+        usable = found.usable if trusted is None else found.usable & np.isin(found.index, trusted)
+        pose = fit_pose_robustly(replace(found, usable=usable))[1]
         if not _moves_rays_far(pose, found):
             break
         aligned = measurement.moved(pose)
@@ -266,11 +227,6 @@ def align(
             break
         measurement, total, found = aligned, total + pose, new_residuals
     return AlignedMeasurement(measurement, found, total)
-
-
-def _restricted_to(residuals: Residuals, trusted: NDArray[np.int64] | None) -> Residuals:
-    """Restrict the usable points to the trusted ones."""
-    return residuals if trusted is None else replace(residuals, usable=residuals.usable & np.isin(residuals.index, trusted))
 
 
 def _moves_rays_far(pose: FloatArray, residuals: Residuals) -> bool:
@@ -301,7 +257,5 @@ def at_points_of(found: Residuals, part: Residuals) -> Residuals:
     """
     registered_residuals, _, noise_ratio = fit_pose_robustly(found)
     good = found.usable & (np.abs(registered_residuals) < thresholds().points.outlier_sigmas * noise_ratio * found.sigma)
-    place = np.full(int(max(found.index.max(initial=-1), part.index.max())) + 1, -1)
-    place[found.index[good]] = np.flatnonzero(good)
-    rows = place[part.index]
-    return found.part(rows[rows >= 0])
+    rows = found.values_at(np.where(good, np.arange(len(good)), np.nan), part.index)
+    return found.part(rows[np.isfinite(rows)].astype(np.int64))

@@ -15,7 +15,6 @@ from scipy.linalg.lapack import dpotri
 
 from scene.geometry.mesh import FloatArray
 from sensors.effects.matching_noise import MatchingNoise, NodeNoise
-from sensors.models.sensor_model import StereoModel
 from sensors.signal_chain.node_grid import MEAN_VARIANCE
 
 _MOST_NODES = 2500
@@ -59,10 +58,7 @@ class NodeField:
 
     @cached_property
     def variance(self) -> float:
-        """Variance of the grid-correlated noise at a point, averaged over a sample of the points, px².
-
-        It is 0 if the noise model has no grid nodes.
-        """
+        """Variance of the grid-correlated noise at a point, averaged over a sample of the points, px²; 0 without nodes."""
         some = self.weights[:: max(self.weights.shape[0] // _SAMPLE, 1)]
         return float(np.mean((some @ self.covariance * some.toarray()).sum(axis=1))) if some.shape[1] else 0.0
 
@@ -90,66 +86,41 @@ class GridCorrelatedNoise:
     effects: tuple[NodeNoise, ...] = ()
     pixels: FloatArray | None = None
 
-    @classmethod
-    def of(cls, model: StereoModel, pixels: FloatArray) -> GridCorrelatedNoise:
-        """Collect those noise terms of a sensor model that neighbouring points share (grid-correlated noise).
-
-        Parameters
-        ----------
-        model : The sensor model of the stereo pair; its other noise terms are ignored.
-        pixels : (n, 2) column and row of each point in the left image, px.
-        """
-        return cls(_grid_correlated(model.matching_noise), pixels)
-
     def part(self, rows: Any) -> GridCorrelatedNoise:
         """Return the grid-correlated noise at a subset of the n points, given as row numbers, a mask (n,) or a slice."""
         return self if self.pixels is None else replace(self, pixels=self.pixels[rows])
 
     def with_effects(self, effects: Sequence[MatchingNoise]) -> GridCorrelatedNoise:
-        """Return this grid-correlated noise with further noise terms added.
-
-        effects: noise terms of a stereo matcher; those that are not grid-correlated (such as white noise) are ignored.
-        """
-        return replace(self, effects=(*self.effects, *_grid_correlated(effects)))
+        """Return this noise with the grid-correlated ones among further noise terms of a stereo matcher added."""
+        added = (effect for effect in effects if isinstance(effect, NodeNoise) and not effect.is_null)
+        return replace(self, effects=(*self.effects, *added))
 
     def node_field(self, count: int) -> NodeField:
         """Return the grid-correlated noise of all points in matrix form, for the covariance in a least-squares fit.
 
-        Noise whose grid is finer than the mean spacing of the points acts like white noise and is left out.
+        Noise whose grid is finer than the mean spacing of the points acts like white noise and is left out. The other effects get
+        one grid with half the spacing of the finest effect's grid, whose offset is unknown. If that would be too many nodes, a
+        coarser grid gets the same power at long wavelengths, which is 9/4 of the variance times the square of the spacing (for
+        bilinear interpolation).
 
         count: number n of points. Without grid-correlated noise the matrix of weights is (n, 0).
         """
+        nothing = NodeField(sparse.csr_array((count, 0)), np.zeros((0, 0)))
         if self.pixels is None or not count:
-            return _empty_field(count)
+            return nothing
         area = float(np.prod(np.maximum(np.ptp(self.pixels, axis=0), 1.0)))
         coarse = [effect for effect in self.effects if effect.step_px**2 > area / count]
-        return _on_nodes(coarse, self.pixels, area) if coarse else _empty_field(count)
+        if not coarse:
+            return nothing
+        step = max(min(effect.step_px for effect in coarse) / 2, float(np.sqrt(area / _MOST_NODES)))
+        weights, nodes = _bilinear(self.pixels, step)
+        place = np.rint(nodes / step).astype(np.int64)
+        matrix = np.sum([_covariance_of_nodes(place, _covariance_by_offset(effect, step)) for effect in coarse], axis=0)
+        return NodeField(weights, matrix + _RIDGE * matrix[0, 0] * np.eye(len(nodes)))
 
 
 NO_CORRELATED_NOISE = GridCorrelatedNoise()
 """Nothing that neighbouring points share."""
-
-
-def _empty_field(count: int) -> NodeField:
-    """A field without nodes for `count` points."""
-    return NodeField(sparse.csr_array((count, 0)), np.zeros((0, 0)))
-
-
-def _on_nodes(effects: list[NodeNoise], pixels: FloatArray, area: float) -> NodeField:
-    """Return the joint covariance of all effects on one grid of nodes.
-
-    The grid has half the spacing of the finest effect's grid, whose offset is unknown. If that would be too many nodes, a coarser
-    grid gets the same power at long wavelengths, which is 9/4 of the variance times the square of the spacing (for bilinear
-    interpolation).
-    """
-    step = max(min(effect.step_px for effect in effects) / 2, float(np.sqrt(area / _MOST_NODES)))
-    weights, nodes = _bilinear(pixels, step)
-    place = np.rint(nodes / step).astype(np.int64)
-    matrix = sum(
-        (_covariance_of_nodes(place, _covariance_by_offset(effect, step)) for effect in effects),
-        np.zeros((len(nodes), len(nodes))),
-    )
-    return NodeField(weights, matrix + _RIDGE * matrix[0, 0] * np.eye(len(nodes)))
 
 
 def _covariance_by_offset(effect: NodeNoise, step: float) -> FloatArray:
@@ -196,8 +167,3 @@ def _bilinear(pixels: FloatArray, step_px: float) -> tuple[sparse.csr_array, Flo
     rows = np.repeat(np.arange(len(pixels)), 4)
     found = sparse.csr_array((np.stack(weights, axis=1).ravel(), (rows, number.ravel())), shape=(len(pixels), len(nodes)))
     return found, step_px * (np.stack([nodes % width, nodes // width], axis=1) + corner.min(axis=0))
-
-
-def _grid_correlated(effects: Sequence[MatchingNoise]) -> tuple[NodeNoise, ...]:
-    """The grid-correlated ones among some effects, without those that are zero."""
-    return tuple(effect for effect in effects if isinstance(effect, NodeNoise) and not effect.is_null)

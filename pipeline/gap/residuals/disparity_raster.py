@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import gaussian_filter, maximum_filter1d
 
 from pipeline.formats.measurements.measurement import StereoMeasurement
 from pipeline.gap.residuals.nominal_pair import NominalPair, PixelGeometry, is_hidden, pixel_rays, project, real_pair
@@ -60,15 +61,8 @@ class DisparityRaster:
     def of(cls, measurement: StereoMeasurement, geometry: PixelGeometry) -> DisparityRaster | None:
         """Compute the disparities of the reference surface on the pixel raster of a measured stereo pair.
 
-        Parameters
-        ----------
-        measurement : The stereo pair with its reference surface and sensor model.
-        geometry : The matched pixels of its n points; they determine the spacing of the raster.
-
-        Returns
-        -------
-        The raster; None if the pixels lie on no raster, if it has more than 40 million cells, or if the cameras miss the
-        reference.
+        geometry: the matched pixels of its n points, which determine the spacing of the raster. Returns None if the pixels lie on
+        no raster, if it has more than 40 million cells, or if the cameras miss the reference.
         """
         step = raster_cell_px(geometry.u, geometry.v)
         if step is None or raster_cell_count(geometry.u, geometry.v, step) > MOST_CELLS:
@@ -97,10 +91,7 @@ class DisparityRaster:
 
     @property
     def depth_step_px(self) -> float:
-        """Threshold by which depth steps of the rock are found in the raster, px.
-
-        There is a step between two neighbouring cells if their disparities differ by more.
-        """
+        """Threshold of depth steps of the rock, px: there is one between neighbouring cells whose disparities differ by more."""
         return max(_STEEP * self.step, 1.0)
 
     def search_part(self) -> tuple[DisparityRaster, NDArray[np.int64]]:
@@ -112,8 +103,6 @@ class DisparityRaster:
             keep them from affecting each other. In rows without points `hidden` is not valid.
         points : (k,) row numbers of those of the n measured points that lie in it.
         """
-        from scipy.ndimage import maximum_filter1d
-
         rows, columns = self.disparity.shape
         if rows * columns <= _SEARCHED:
             return self, np.arange(len(self.row))
@@ -129,59 +118,31 @@ class DisparityRaster:
         return replace(self, disparity=disparity, hidden=hidden, row=place[self.row[points]], column=self.column[points]), points
 
     def at_points(self, raster: NDArray[Any]) -> NDArray[Any]:
-        """Look up the values of an array with the shape of this raster in the cells of the n measured points.
-
-        raster: (rows, columns) values. Returns (n,) values.
-        """
+        """Look up the values (n,) of an array with the shape of this raster in the cells of the n measured points."""
         return np.asarray(raster[self.row, self.column])
 
     def near_border(self, sigma_px: float) -> BoolArray:
-        """Tell which points are so near the border of the common field of view that smoothing cannot be predicted there.
+        """Tell which points (n,) are so near the border of the common field of view that smoothing cannot be predicted there.
 
-        A Gaussian low-pass filter would use disparities beyond the border, which are unknown. A point is near if more than 1 %
-        of the filter's weight lies there. Occlusions do not count as beyond the border.
-
-        Parameters
-        ----------
-        sigma_px : Standard deviation of the filter, px.
-
-        Returns
-        -------
-        (n,) true for points near the border.
+        A Gaussian low-pass filter with standard deviation `sigma_px`, px, would use disparities beyond the border, which are
+        unknown. A point is near if more than 1 % of the filter's weight lies there. Occlusions do not count as beyond the border.
         """
-        from scipy.ndimage import gaussian_filter
-
         inside = (~np.isnan(self.disparity) | self.hidden).astype(np.float64)
         return self.at_points(gaussian_filter(inside, sigma_px / self.step, mode="constant") < 1 - _BEYOND)
 
     def in_filled_occlusions(self, effects: Iterable[Effect]) -> BoolArray:
-        """Tell which measured points lie in occlusions, where a matcher can only have filled in a disparity.
+        """Tell which measured points (n,) lie in occlusions, where a matcher can only have filled in a disparity.
 
-        In an occlusion only the left camera sees the reference. Cells to which an edge effect carries a disparity do not count.
-
-        Parameters
-        ----------
-        effects : Effects of the sensor model, such as edge fattening, which may predict a disparity beside an edge.
-
-        Returns
-        -------
-        (n,) true for points in occlusions.
+        In an occlusion only the left camera sees the reference. Cells to which effects of the sensor model, such as edge
+        fattening, carry a disparity do not count.
         """
         return np.asarray(np.isnan(self.at_points(self.apply(effects))) & self.at_points(self.hidden))
 
     def copied_from_neighbour(self, found: FloatArray, tolerance: float) -> BoolArray:
-        """Tell which measured disparities equal that of a neighbouring cell in the same row of the raster.
+        """Tell which of the measured disparities `found` (n,), px, equal that of a neighbouring cell in the raster's row.
 
-        A stereo matcher that fills occlusions copies disparities from a neighbouring pixel, so equal values reveal it.
-
-        Parameters
-        ----------
-        found : (n,) measured disparities, px.
-        tolerance : Largest difference that counts as equal, px.
-
-        Returns
-        -------
-        (n,) true for copied disparities.
+        A stereo matcher that fills occlusions copies disparities from a neighbouring pixel, so equal values reveal it. tolerance:
+        largest difference that counts as equal, px.
         """
         cells = np.full(self.disparity.shape, np.nan)
         cells[self.row, self.column] = found
@@ -191,13 +152,8 @@ class DisparityRaster:
     def apply(self, effects: Iterable[Effect]) -> FloatArray:
         """Predict the disparities that a matcher with edge fattening, smoothing or filled occlusions gives on the reference.
 
-        Parameters
-        ----------
-        effects : Effects of the sensor model; those in which neighbouring pixels play no part are ignored.
-
-        Returns
-        -------
-        (rows, columns) disparities, px; NaN without a match.
+        effects: effects of the sensor model; those in which neighbouring pixels play no part are ignored. Returns (rows, columns)
+        disparities, px; NaN without a match.
         """
         found = self.disparity
         filters = (effect for effect in effects if isinstance(effect, RasterEffect))
@@ -206,17 +162,10 @@ class DisparityRaster:
         return found
 
     def added_by(self, effects: Iterable[Effect], disparity: FloatArray) -> FloatArray:
-        """Return by how much edge fattening, smoothing and filled occlusions change the disparity at each measured point.
+        """Return by how much (n,), px, edge fattening, smoothing and filled occlusions change the disparity at the points.
 
-        Parameters
-        ----------
-        effects : Effects of the sensor model; those of other kinds are ignored.
-        disparity : (n,) disparity of the reference at the points, px. It stands in for the raster's value in cells that are
-            NaN.
-
-        Returns
-        -------
-        (n,) disparity with these effects minus disparity of the reference, px; 0 where the effects give no match.
+        effects: effects of the sensor model, as for `apply`. disparity: (n,) disparity of the reference at the points, px, which
+        stands in for the raster's value in cells that are NaN. The result is 0 where the effects give no match.
         """
         plain = self.at_points(self.disparity)
         return np.nan_to_num(self.at_points(self.apply(effects)) - np.where(np.isnan(plain), disparity, plain))
@@ -228,21 +177,15 @@ def apply_smoothing(effects: Iterable[Effect], geometry: PixelGeometry, columns:
     A move of the cameras changes the disparities in a pattern that follows the rock's relief, and the matcher smooths it. If
     the points are a subsample, only the pixels that are present are averaged.
 
-    Parameters
-    ----------
-    effects : Effects of the sensor model; only smoothing is used.
-    geometry : The pixels of n points.
-    columns : (n, k) changes of the disparity at the points by k parameters, px per unit of the parameter.
-
-    Returns
-    -------
-    (n, k) smoothed changes; unchanged without smoothing, if the pixels lie on no raster, or if it has over 40 million cells.
+    effects: effects of the sensor model; only smoothing is used. columns: (n, k) changes of the disparity at the n points by k
+    parameters, px per unit of the parameter. They are returned unchanged without smoothing, if the pixels lie on no raster, or if
+    it has over 40 million cells.
     """
     filters = [effect for effect in effects if isinstance(effect, Smoothing)]
     step = raster_cell_px(geometry.u, geometry.v) if filters else None
     if step is None or raster_cell_count(geometry.u, geometry.v, step) > MOST_CELLS:
         return columns
-    row, column = _cell(geometry.v, step), _cell(geometry.u, step)
+    row, column = cell_numbers(geometry.v, step), cell_numbers(geometry.u, step)
     matched = np.zeros((int(row.max()) + 1, int(column.max()) + 1), dtype=bool)
     matched[row, column] = np.isfinite(columns).all(axis=1)
     low_passes = [LowPass.over(matched, effect.sigma_px / step) for effect in filters]
@@ -258,12 +201,9 @@ def apply_smoothing(effects: Iterable[Effect], geometry: PixelGeometry, columns:
 
 
 def raster_cell_count(u: FloatArray, v: FloatArray, step: float) -> int:
-    """Return the number of cells of a raster that covers all given pixels, to tell whether it would be too large.
+    """Return the number of cells, `step` px wide, of a raster that covers all pixels, to tell whether it would be too large.
 
-    Parameters
-    ----------
-    u, v : (n,) columns and rows of the pixels, px.
-    step : Spacing of the cells, px.
+    u, v: (n,) columns and rows of the pixels, px.
     """
     return int(np.prod([np.rint(np.ptp(x) / step) + 1 for x in (u, v)]))
 
@@ -282,42 +222,32 @@ def _raster_axis(x: FloatArray, step: float, size: int) -> tuple[FloatArray, NDA
     clouds are cropped after matching.
     """
     before, after = (int(np.clip(room // step, 0, _MARGIN)) for room in (x.min(), size - x.max()))
-    cell = _cell(x, step)
+    cell = cell_numbers(x, step)
     return np.asarray(x.min() + step * np.arange(-before, int(cell.max()) + 1 + after), dtype=np.float64), cell + before
 
 
-def _cell(x: FloatArray, step: float) -> NDArray[np.int64]:
-    """(n,) number of the row or column of each point, counted from the first, with `step` px each."""
+def cell_numbers(x: FloatArray, step: float) -> NDArray[np.int64]:
+    """Return the number (n,) of the column (or row) of a raster in which each point lies, counted from the first.
+
+    x: (n,) columns (or rows) of the points' pixels, px; step: spacing of the raster's cells, px.
+    """
     return np.rint((x - x.min()) / step).astype(np.int64)
 
 
 def raster_cell_px(u: FloatArray, v: FloatArray) -> float | None:
     """Find the spacing of the pixel raster on which a stereo matcher measured, such as every second or fourth pixel.
 
-    Parameters
-    ----------
-    u, v : (n,) columns and rows of the measured pixels, px.
-
-    Returns
-    -------
-    The spacing of the columns or of the rows, whichever is smaller, px; None if the pixels lie on no raster.
+    u, v: (n,) columns and rows of the measured pixels, px. Returns the spacing of the columns or of the rows, whichever is
+    smaller, px; None if the pixels lie on no raster.
     """
     steps = [step for step in (raster_spacing_px(u), raster_spacing_px(v)) if step is not None]
     return min(steps, default=None)
 
 
 def raster_spacing_px(u: FloatArray) -> float | None:
-    """Find the spacing of the columns, or of the rows, of a raster on which measured pixels lie.
+    """Find the spacing of the columns, or of the rows, of a raster on which measured pixels lie, px; None without a raster.
 
-    Pixels that a registration has shifted a little still count.
-
-    Parameters
-    ----------
-    u : (n,) columns (or rows) of the pixels, px.
-
-    Returns
-    -------
-    The spacing, px; None if the pixels lie on no raster.
+    Pixels that a registration has shifted a little still count. u: (n,) columns (or rows) of the pixels, px.
     """
     gaps = np.diff(np.unique(np.rint(1000 * u).astype(np.int64))) / 1000  # integers are quicker to tell apart
     step = float(np.median(gaps)) if len(gaps) > 10 else 0.0

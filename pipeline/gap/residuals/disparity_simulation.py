@@ -31,8 +31,8 @@ def simulate_disparities(
 
     The simulated depth maps have cells of 2, 4 or 8 px. The size is chosen whose cell centres lie nearest to the pixels. The
     simulated disparities are corrected for the distance of each pixel from the centre of its cell, by the disparities that the
-    simulated cameras see on the reference at both places. If the measurement's own
-    raster has another spacing, effects that depend on neighbouring cells are applied on that raster.
+    simulated cameras see on the reference at both places. If the measurement's own raster has another spacing, effects that
+    depend on neighbouring cells are applied on that raster.
 
     Parameters
     ----------
@@ -55,11 +55,9 @@ def simulate_disparities(
     middle = nominal.surface_disparity(measurement.scene, (columns + 0.5) * step, (rows + 0.5) * step, real)
     beside = g.disparity + (middle - nominal.surface_disparity(measurement.scene, g.u, g.v, real))
     pair, shaped = _on_own_raster(pair, measurement, g, step)
-    drawn = []
-    for seen in _points(pair, measurement, rows * width + columns, randoms):
-        disparity = nominal.disparity(project(nominal.pair.left, seen), project(nominal.pair.right, seen))
-        drawn.append(disparity - beside + shaped)
-    return np.stack(drawn)
+    points = _points(pair, measurement, rows * width + columns, randoms)
+    drawn = [nominal.disparity(project(nominal.pair.left, each), project(nominal.pair.right, each)) for each in points]
+    return np.stack(drawn) - beside + shaped
 
 
 def _on_own_raster(
@@ -92,8 +90,7 @@ def _points(
 
     Only those cells are traced, unless an effect uses neighbouring ones.
     """
-    if effects_needing_neighbours(pair.model):
-        return [pair.observe(measurement.scene, random).points.reshape(-1, 3)[cells] for random in randoms]
-    chosen, place = np.unique(cells, return_inverse=True)
-    some = restrict_to(pair, chosen.astype(np.uint32))
-    return [some.observe(measurement.scene, random).points.reshape(-1, 3)[place] for random in randoms]
+    if not effects_needing_neighbours(pair.model):
+        chosen, cells = np.unique(cells, return_inverse=True)
+        pair = restrict_to(pair, chosen.astype(np.uint32))
+    return [pair.observe(measurement.scene, random).points.reshape(-1, 3)[cells] for random in randoms]

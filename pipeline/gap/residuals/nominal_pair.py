@@ -6,7 +6,7 @@ The nominal pair has the calibration that the measurement states; the real pair 
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -40,7 +40,7 @@ class PixelGeometry:
     disparity : (n,) disparity of the reference, px.
     found : (n,) measured disparity, px.
     point, normal : (n, 3) point of the reference that the pixel sees, m, and its unit normal, wall frame.
-    radius, radius_right : (n,) distance from the centre of the left and of the right image, px.
+    radius : (n,) distance from the centre of the left image, px.
     tangent : (n,) vertical slope of the line of sight in the rectified left image: (row - principal row) / focal length in px.
     infinity : (n,) disparity of a point at infinity, px.
     shaped : (n,) change of the disparity by edge fattening, smoothing and filled occlusions of the sensor model, px; 0 without.
@@ -56,7 +56,6 @@ class PixelGeometry:
     point: FloatArray
     normal: FloatArray
     radius: FloatArray
-    radius_right: FloatArray
     tangent: FloatArray
     infinity: FloatArray
     shaped: FloatArray
@@ -67,7 +66,7 @@ class PixelGeometry:
         return len(self.u)
 
     def part(self, rows: Rows) -> PixelGeometry:
-        """Return the geometry of a subset of the n matched pixels, given as row numbers, a mask (n,) or a slice."""
+        """Return the geometry of a subset of the n matched pixels."""
         return select_rows(self, rows)
 
     @property
@@ -76,14 +75,8 @@ class PixelGeometry:
         return np.stack([self.u, self.v], axis=1)
 
     @property
-    def gradient(self) -> FloatArray:
-        """(n, 2) change of the reference's disparity along the row and along the column, px per px; 0 if not computed."""
-        sides = (self.along_row, self.along_column)
-        return np.stack([np.zeros(len(self)) if each is None else each for each in sides], axis=1)
-
-    @property
     def departure(self) -> FloatArray:
-        """(n,) measured minus reference disparity, px. Predicted systematic errors of the sensor are still in it."""
+        """(n,) measured minus reference disparity, px."""
         return np.asarray(self.found - self.disparity)
 
 
@@ -121,7 +114,7 @@ class NominalPair:
         (n,) disparities, px.
         """
         first, second = ([on_device(mi.Float64, each) for each in pixel] for pixel in (left, right))
-        return _on_host(self.left_column(*first) - self.right_column(*second))[0]
+        return _on_host(self._left(*first)[0] - self._right(*second)[0])[0]
 
     def surface_disparity(self, scene: RayCaster, u: FloatArray, v: FloatArray, real: CameraPair | None = None) -> FloatArray:
         """Predict the disparity of the surface point that each pixel of the left image sees.
@@ -144,56 +137,31 @@ class NominalPair:
         point = origin + dr.select(hits.valid, hits.distance, dr.nan) * ray
         seen = _pixel(right, point)
         dr.eval(*seen)  # the next kernel is that of `disparity`, and need not be compiled again
-        return _on_host(self.left_column(*pixel) - self.right_column(*seen))[0]
-
-    def left_column(self, u: mi.Float64, v: mi.Float64) -> mi.Float64:
-        """Transform pixels of the left image to the rectified image, and return their columns, px: one half of a disparity.
-
-        u, v: (n,) columns and rows in the original image, px. These and the result are arrays on the ray-tracing device.
-        """
-        rect = self.geometry
-        return rectified_pixel(self.pair.left, rect.left, u, v, rect.f, rect.u_left, rect.v)[0]
+        return _on_host(self._left(*pixel)[0] - self._right(*seen)[0])[0]
 
     def tangent(self, u: FloatArray, v: FloatArray) -> FloatArray:
-        """Return the vertical slope of each pixel's line of sight in the rectified left image, to model pixel locking.
+        """Return the vertical slope (n,) of each pixel's line of sight in the rectified left image, to model pixel locking.
 
-        It is (row - principal row) / focal length.
-
-        Parameters
-        ----------
-        u, v : (n,) columns and rows in the original left image, px.
-
-        Returns
-        -------
-        (n,) slopes, without unit.
+        u, v: (n,) columns and rows in the original left image, px. The slope is (row - principal row) / focal length in px.
         """
-        rect = self.geometry
         pixel = on_device(mi.Float64, u), on_device(mi.Float64, v)
-        row = rectified_pixel(self.pair.left, rect.left, *pixel, rect.f, rect.u_left, rect.v)[1]
-        return _on_host(row_tangent(rect, row))[0]
+        return _on_host(row_tangent(self.geometry, self._left(*pixel)[1]))[0]
 
-    def right_column(self, u: mi.Float64, v: mi.Float64) -> mi.Float64:
-        """Transform pixels of the right image to the rectified image, and return their columns, px: one half of a disparity.
-
-        u, v: (n,) columns and rows in the original image, px. These and the result are arrays on the ray-tracing device.
-        """
+    def _left(self, u: mi.Float64, v: mi.Float64) -> tuple[mi.Float64, mi.Float64]:
+        """Columns and rows in the rectified left image of pixels of the original one, px, on the device."""
         rect = self.geometry
-        return rectified_pixel(self.pair.right, rect.right, u, v, rect.f, rect.u_right, rect.v)[0]
+        return rectified_pixel(self.pair.left, rect.left, u, v, rect.f, rect.u_left, rect.v)
 
-    def right_column_of(self, real: Camera, point: mi.Array3f64) -> mi.Float64:
-        """Predict in which rectified column points appear if the real right camera differs from the calibrated one.
+    def _right(self, u: mi.Float64, v: mi.Float64) -> tuple[mi.Float64, mi.Float64]:
+        """Columns and rows in the rectified right image of pixels of the original one, px, on the device."""
+        rect = self.geometry
+        return rectified_pixel(self.pair.right, rect.right, u, v, rect.f, rect.u_right, rect.v)
+
+    def _right_column_of(self, real: Camera, point: mi.Array3f64) -> mi.Float64:
+        """Columns in the rectified right image at which points (wall frame) appear to the right camera `real`, on the device.
 
         The real camera takes the image. The image is rectified with the nominal calibration, because the user does not know the
         difference.
-
-        Parameters
-        ----------
-        real : The right camera as it really is.
-        point : n points, wall frame, m, on the ray-tracing device.
-
-        Returns
-        -------
-        (n,) columns in the rectified right image, px, on the ray-tracing device.
         """
         x, y = _seen_tangents(real, point)
         if _interior(real) != _interior(self.pair.right):  # else both cameras have the same tangents
@@ -205,31 +173,17 @@ class NominalPair:
 def project(camera: Camera, points: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Project points into the image of a camera, with its lens distortion.
 
-    Parameters
-    ----------
-    camera : The camera with its pose.
-    points : (n, 3) points in the frame of the camera's pose, such as the wall frame, m.
-
-    Returns
-    -------
-    (n,) columns and (n,) rows, px.
+    points: (n, 3), in the frame of the camera's pose, such as the wall frame, m. Returns columns (n,) and rows (n,), px.
     """
     u, v = _on_host(*_pixel(camera, vectors_on_device(points)))
     return u, v
 
 
 def pixel_rays(camera: Camera, u: FloatArray, v: FloatArray) -> FloatArray:
-    """Return the directions in which pixels of a camera look, corrected for lens distortion.
+    """Return the directions (n, 3) in which pixels of a camera look, corrected for lens distortion.
 
-    Parameters
-    ----------
-    camera : The camera with its pose.
-    u, v : (n,) columns and rows, px.
-
-    Returns
-    -------
-    (n, 3) directions in the frame of the camera's pose, such as the wall frame. They are not of unit length: the component
-    along the camera's axis is 1.
+    u, v: (n,) columns and rows, px. The directions are in the frame of the camera's pose, such as the wall frame. They are not of
+    unit length: the component along the camera's axis is 1.
     """
     return np.stack(_on_host(*_ray(camera, on_device(mi.Float64, u), on_device(mi.Float64, v))), axis=1)
 
@@ -289,17 +243,10 @@ def steps_from_planes(
 
 
 def is_hidden(scene: RayCaster, position: FloatArray, points: FloatArray) -> BoolArray:
-    """Tell which points a camera does not see, because the surface itself lies in front of them (occlusions).
+    """Tell which points (n,) a camera does not see, because the surface `scene` itself lies in front of them (occlusions).
 
-    Parameters
-    ----------
-    scene : The surface, prepared for ray tracing.
-    position : (3,) position of the camera, wall frame, m.
-    points : (n, 3) points on the surface, wall frame, m; NaN counts as not hidden.
-
-    Returns
-    -------
-    (n,) true for hidden points.
+    position: (3,) position of the camera. points: (n, 3) points on the surface; NaN counts as not hidden. Both are in the wall
+    frame, m.
     """
     back = np.nan_to_num(points, nan=1e9) - position
     length = np.linalg.norm(back, axis=1)
@@ -325,7 +272,7 @@ def predict_disparities(nominal: NominalPair, real: Iterable[CameraPair], geomet
     """
     u, v = on_device(mi.Float64, geometry.u), on_device(mi.Float64, geometry.v)
     point, normal = vectors_on_device(geometry.point), vectors_on_device(geometry.normal)
-    column = nominal.left_column(u, v)
+    column, _ = nominal._left(u, v)
     dr.eval(column)
     known: dict[tuple[float, ...], tuple[mi.Float64, mi.Float64]] = {}
 
@@ -340,49 +287,34 @@ def predict_disparities(nominal: NominalPair, real: Iterable[CameraPair], geomet
         origin = vector(pair.left.position)
         ray = rotated(pair.left.rotation, mi.Array3f64(*tangents(pair.left), 1.0))
         met = origin + dr.dot(point - origin, normal) / dr.dot(ray, normal) * ray
-        disparity = column - nominal.right_column_of(pair.right, met)
+        disparity = column - nominal._right_column_of(pair.right, met)
         dr.eval(disparity)  # launches the same kernel for each pair, without waiting
         return disparity
 
     return _on_host(*[seen(pair) for pair in real])
 
 
-def moved_pair(pair: CameraPair, centre: FloatArray, vector: FloatArray, *, turned: bool) -> CameraPair:
-    """Shift or rotate both cameras of a stereo pair together, as one rigid body.
+def moved_pairs(pair: CameraPair, step: float) -> list[CameraPair]:
+    """Move both cameras of a pair together, as one rigid body, in six ways, to compute derivatives by the pose.
 
-    Parameters
-    ----------
-    pair : The cameras.
-    centre : (3,) point about which they are rotated, m, in the frame of the pair.
-    vector : (3,) shift, m, or small rotation vector, rad, in the frame of the pair.
-    turned : Whether `vector` is a rotation.
-
-    Returns
-    -------
-    The moved pair, in the same frame.
+    They are shifted by `step`, m, along x, y and z, and then rotated by `step`, rad, about these axes through the left camera.
     """
-    if not turned:
-        return pair.shifted("both", vector)
-    x, y, z = vector
-    turn = np.eye(3) + np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
-    sides = (
-        Camera(**{**camera.__dict__, "rotation": turn @ camera.rotation, "position": centre + turn @ (camera.position - centre)})
-        for camera in (pair.left, pair.right)
-    )
-    return CameraPair(*sides)
+    units, centre = step * np.eye(3), pair.left.position
+
+    def turned(camera: Camera, vector: FloatArray) -> Camera:
+        x, y, z = vector
+        turn = np.eye(3) + np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+        return replace(camera, rotation=turn @ camera.rotation, position=centre + turn @ (camera.position - centre))
+
+    shifted = [pair.shifted("both", unit) for unit in units]
+    return [*shifted, *(CameraPair(turned(pair.left, unit), turned(pair.right, unit)) for unit in units)]
 
 
 def real_pair(effects: tuple[Effect, ...], measurement: StereoMeasurement) -> CameraPair:
-    """Return the cameras of a stereo pair as a sensor model says they really are: with its errors of calibration and pose.
+    """Return the cameras of a stereo pair, wall frame, as a sensor model says they are: with its errors of calibration and pose.
 
-    Parameters
-    ----------
-    effects : Effects of the sensor model; those that do not change the cameras are ignored.
-    measurement : The measurement with its stated cameras, and the wall frame.
-
-    Returns
-    -------
-    The two cameras, wall frame.
+    effects: effects of the sensor model; those that do not change the cameras are ignored. measurement: the measurement with its
+    stated cameras.
     """
     pair = measurement.cameras
     for effect in effects:

@@ -22,17 +22,13 @@ _LEAST_COSINE = 0.05
 class RayGeometry(PulseGeometry):
     """Geometry of n laser rays with the measured ranges: the quantities on which errors of ranges depend.
 
-    It has all fields of `PulseGeometry`: recorded directions, range to the reference surface, cosine of the incidence angle,
-    received power, scan line and time. Range and incidence angle belong to the true direction of the beam, which the sensor
+    It has all fields of `PulseGeometry`. Range and incidence angle belong to the true direction of the beam, which the sensor
     model predicts. The last four fields are for a reference surface whose vertices are noisy measured points.
 
     Attributes
     ----------
     measured_m : (n,) measured ranges, m.
-    bulge_m : (n,) how much nearer a curved surface through the vertices lies than the triangle between them, m. It is already
-        subtracted from the field `range_m`. None if the triangles are used as they are.
-    corner : (n, 3) row numbers of the vertices of the triangle that each ray hits; None if the vertices have no errors of their
-        own.
+    bulge_m, corner : As `bulge` and `corner` of `RayHits`.
     weight : (n, 3) weights with which the vertices' errors enter the range: the barycentric weights at the hit, larger where the
         reference is less precise than usual; None if `corner` is None.
     plane_normal : (n, 3) normal of the plane on which a ray is assumed to hit if it is turned a little, scanner frame. None: it
@@ -46,7 +42,7 @@ class RayGeometry(PulseGeometry):
     plane_normal: FloatArray | None = None
 
     def part(self, rows: Rows) -> RayGeometry:
-        """Return the geometry of a subset of the n rays, given as row numbers, a mask or a slice."""
+        """Return the geometry of a subset of the n rays."""
         return select_rows(self, rows)
 
     @property
@@ -127,7 +123,7 @@ def cast_rays(measurement: TlsMeasurement, axes: list[FloatArray]) -> RayHits:
         found = replace(found, normal=_interpolated_normals(scene.mesh, corner, weight))
     if measurement.planes is None:
         return found
-    return _smoothed_hits(found, measurement.planes, ray, (corner, weight, scene.mesh.vertices[corner]))
+    return _smoothed_hits(found, measurement.planes, ray, corner, weight, scene.mesh.vertices[corner])
 
 
 def _interpolated_normals(mesh: TriangleMesh, corner: IntArray, weight: FloatArray) -> FloatArray:
@@ -142,10 +138,10 @@ def _interpolated_normals(mesh: TriangleMesh, corner: IntArray, weight: FloatArr
 
 
 def redirect_hits(found: RayHits, nominal: FloatArray, real: FloatArray) -> RayHits:
-    """Predict where rays hit if they are turned a little, on the plane that each ray hits in its recorded direction.
+    """Predict where rays hit if errors of the scanner's axes turn them, on the plane that each hits in its recorded direction.
 
-    Rays are turned if the sensor model contains errors of the scanner's axes. This is used instead of tracing if the
-    reference's points are noisy: a ray traced anew would follow the tilt of a single triangle, which is noise.
+    This is used instead of tracing if the reference's points are noisy: a ray traced anew would follow the tilt of a single
+    triangle, which is noise.
 
     Parameters
     ----------
@@ -162,13 +158,15 @@ def redirect_hits(found: RayHits, nominal: FloatArray, real: FloatArray) -> RayH
     return replace(found, distance=distance, cos_incidence=np.abs(after))
 
 
-_Triangles = tuple[IntArray, FloatArray, FloatArray]
-"""The triangles that were hit: vertex numbers (n, 3), barycentric weights (n, 3), and corner positions (n, 3 corners, 3)."""
+def _smoothed_hits(
+    found: RayHits, planes: PointPlanes, ray: FloatArray, corner: IntArray, weight: FloatArray, at: FloatArray
+) -> RayHits:
+    """Take incidence angle and scatter from planes through the points; if noise dominates, also normal and a curved surface.
 
-
-def _smoothed_hits(found: RayHits, planes: PointPlanes, ray: FloatArray, triangles: _Triangles) -> RayHits:
-    """Take incidence angle and scatter from planes through the points; if noise dominates, also normal and a curved surface."""
-    corner = triangles[0]
+    With barycentric weights b (n, 3), normals n and positions p (`at`, (n, 3 corners, 3)) at a triangle's corners, that surface
+    is higher than the triangle by the sum over its sides of 4 b_i b_j d_ij, where d_ij = (n_j - n_i)·(p_j - p_i) / 8 is the
+    height of an arc above its chord.
+    """
     normal = planes.normal[corner]
     normal = normal * np.where(np.einsum("nki,ni->nk", normal, found.normal) < 0, -1.0, 1.0)[..., None]
     mean = normal.mean(axis=1)
@@ -178,20 +176,10 @@ def _smoothed_hits(found: RayHits, planes: PointPlanes, ray: FloatArray, triangl
     found = replace(found, cos_incidence=cosine, scatter=scatter)
     if not planes.noise_dominates:
         return found
-    towards = np.where(np.einsum("ni,ni->n", ray, found.normal) > 0, -1.0, 1.0)
-    bulge = towards * _height_above_triangles(normal, triangles) / np.maximum(cosine, _LEAST_COSINE)
-    return replace(found, distance=found.distance - bulge, normal=mean, bulge=bulge)
-
-
-def _height_above_triangles(normal: FloatArray, triangles: _Triangles) -> FloatArray:
-    """(n,) height of a curved surface above its triangles, from normals (n, 3 corners, 3) at their corners.
-
-    With barycentric coordinates b it is the sum over the sides of 4 b_i b_j d_ij, where d_ij = (n_j - n_i)·(p_j - p_i) / 8 is the
-    height of an arc above its chord.
-    """
-    _, weight, at = triangles
     height = np.zeros(len(weight))
     for i, j in ((0, 1), (1, 2), (2, 0)):
         arc = np.einsum("ni,ni->n", normal[:, j] - normal[:, i], at[:, j] - at[:, i]) / 8
         height += 4 * weight[:, i] * weight[:, j] * arc
-    return height
+    towards = np.where(np.einsum("ni,ni->n", ray, found.normal) > 0, -1.0, 1.0)
+    bulge = towards * height / np.maximum(cosine, _LEAST_COSINE)
+    return replace(found, distance=found.distance - bulge, normal=mean, bulge=bulge)

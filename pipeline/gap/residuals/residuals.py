@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, fields, replace
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, ClassVar, Protocol, Self, TypeVar
+from typing import Any, ClassVar, Protocol, Self, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,20 +16,18 @@ from scene.geometry.mesh import FloatArray
 from sensors.effects import Effects, catalogue
 from sensors.effects.base import Effect, Sensor
 
-if TYPE_CHECKING:
-    from _typeshed import DataclassInstance
-
 BoolArray = NDArray[np.bool_]
 Rows = BoolArray | NDArray[np.int64] | slice
 """Which of n points are meant: a mask, row numbers or a slice."""
-_Columns = TypeVar("_Columns", bound="DataclassInstance")
+_Columns = TypeVar("_Columns")
+POINT_COLUMNS = ("value", "sigma", "unit_m", "usable", "on_smooth_surface", "pose_jacobian", "wall_xy", "index")
+"""Fields of `Residuals` that are arrays with a row for each point."""
 
 
 class Geometry(Protocol):
-    """Interface of the geometry of n measured points: the quantities on which errors of the sensor depend.
+    """Interface of the geometry of n measured points: the quantities on which errors of the sensor depend, such as the range.
 
-    Examples are the range, the incidence angle and the position in the image. Subclasses are for laser rays, matched pixels,
-    and points of a cloud without cameras.
+    There is a geometry of laser rays, one of matched pixels, and one of the points of a cloud without cameras.
     """
 
     def __len__(self) -> int: ...
@@ -47,28 +45,18 @@ class Geometry(Protocol):
 
     @property
     def departure(self) -> FloatArray:
-        """(n,) measured observable minus that of the reference surface, with predicted systematic errors still in it.
-
-        It is a range or a distance in m, or a disparity in px.
-        """
-
-
-def _order(values: FloatArray) -> NDArray[np.int32]:
-    """Row numbers that sort the values, ascending; equal values keep their order."""
-    return np.argsort(values, kind="stable").astype(np.int32)
+        """(n,) measured observable minus that of the reference surface, m or px, with predicted systematic errors still in it."""
 
 
 def select_rows(columns: _Columns, rows: Rows) -> _Columns:
     """Return a copy of a dataclass of arrays with chosen rows only, to restrict measured quantities to a subset of the points.
 
-    Parameters
-    ----------
-    columns : A dataclass whose fields are arrays (n, ...), one row for each of n points, or None (which stays None).
-    rows : Row numbers, a mask (n,) or a slice.
+    columns: its fields are arrays (n, ...), one row for each of n points, or None (which stays None). rows: row numbers, a mask
+    (n,) or a slice.
     """
-    values: dict[str, Any] = {column.name: getattr(columns, column.name) for column in fields(columns)}
-    kept = _without_mask(rows)
-    return replace(columns, **{name: _rows_of(value, kept) for name, value in values.items() if value is not None})
+    found: Any = columns
+    kept, values = _without_mask(rows), {column.name: getattr(found, column.name) for column in fields(found)}
+    return replace(found, **{name: _rows_of(value, kept) for name, value in values.items() if value is not None})
 
 
 def _without_mask(rows: Rows) -> NDArray[np.int64] | slice:
@@ -150,24 +138,15 @@ class Residuals(ABC):
         """Return the residuals with a `sigma` that is right for means over many neighbouring points.
 
         Divided by sqrt(k), this `sigma` is the standard deviation of a mean of k neighbours. It is larger than that of single
-        points if neighbours share noise. This base class assumes that they do not and returns the residuals unchanged;
-        subclasses may differ.
+        points if neighbours share noise. This base class assumes that they do not.
         """
         return self
 
     def reference_covariance_with(self, other: NDArray[np.int64]) -> FloatArray:
-        """Return the covariance of each point's residual with that of another point due to errors of the reference surface.
+        """Return the covariance (n,), m² or px², of each point's residual with another one's due to errors of the reference.
 
-        It is needed for the variance of differences of neighbouring residuals. This base class returns zeros; subclasses may
-        differ.
-
-        Parameters
-        ----------
-        other : (n,) for each point the row number of the other point.
-
-        Returns
-        -------
-        (n,) covariances, squared unit of the observable (m² or px²).
+        It is needed for the variance of differences of neighbouring residuals. other: (n,) row numbers of the other points. This
+        base class assumes that the reference has no such errors.
         """
         return np.zeros(len(other))
 
@@ -180,29 +159,21 @@ class Residuals(ABC):
     def total_departure(self) -> FloatArray:
         """(n,) measured observable minus that of the reference, m or px, with predicted systematic errors still in it.
 
-        With several epochs, the difference of each epoch's pose from the mean pose has been removed. The error of the mean (or
-        only) pose is still in it, and is fitted together with the effects.
+        The difference of each of several epochs' poses from the mean pose has been removed; the error of the mean pose has not.
         """
         return self.geometry.departure if self.epoch_offset is None else self.geometry.departure - self.epoch_offset
 
     @cached_property
     def sort_orders(self) -> dict[str, NDArray[np.int32]]:
         """For each covariate by name, the (n,) row numbers that sort the points by it, to divide them into bins."""
-        return dict(zip(self.covariates, map_in_threads(_order, self.covariates.values()), strict=True))
+        orders = map_in_threads(lambda x: np.argsort(x, kind="stable").astype(np.int32), self.covariates.values())
+        return dict(zip(self.covariates, orders, strict=True))
 
     def values_at(self, values: FloatArray, index: NDArray[np.int64]) -> FloatArray:
-        """Look up values of these residuals' points by the points' row numbers in the measurement.
+        """Look up values of these residuals' points by row numbers in the measurement, to compare residuals of other points.
 
-        It serves to compare two residuals that do not have the same points.
-
-        Parameters
-        ----------
-        values : (n,) one value for each of the n points of these residuals.
-        index : (m,) row numbers in the measurement of the points for which values are wanted.
-
-        Returns
-        -------
-        (m,) values; NaN for points that have no residual here.
+        values: one for each of the n points of these residuals. index: (m,) row numbers in the measurement of the wanted points.
+        Returns the values (m,); NaN for points that have no residual here.
         """
         found = np.full(int(max(self.index.max(initial=-1), index.max(initial=-1))) + 1, np.nan)
         found[self.index] = values
@@ -211,8 +182,7 @@ class Residuals(ABC):
     def part(self, rows: Rows) -> Self:
         """Return the residuals of a subset of the n points, given as row numbers, a mask (n,) or a slice."""
         kept = _without_mask(rows)
-        names = ("value", "sigma", "unit_m", "usable", "on_smooth_surface", "pose_jacobian", "wall_xy", "index")
-        columns: dict[str, Any] = {name: _rows_of(getattr(self, name), kept) for name in names}
+        columns: dict[str, Any] = {name: _rows_of(getattr(self, name), kept) for name in POINT_COLUMNS}
         return replace(
             self,
             **columns,
@@ -225,28 +195,21 @@ class Residuals(ABC):
     def with_rows_from(self, known: BoolArray, other: Self) -> Self:
         """Replace the residuals of some points, for example by those under a sensor model with more effects.
 
-        Values, predicted standard deviations, Jacobian, covariates and geometry are replaced; `usable` and `on_smooth_surface`
-        stay.
-
-        Parameters
-        ----------
-        known : (n,) true for the points to replace.
-        other : New residuals of just these points, in the same order.
+        known: (n,) true for the points to replace. other: new residuals of just these points, in the same order. `usable` and
+        `on_smooth_surface` stay.
         """
-        names = ("value", "sigma", "unit_m", "pose_jacobian", "wall_xy")
-        columns: dict[str, Any] = {name: _merged(getattr(self, name), getattr(other, name), known) for name in names}
-        columns["covariates"] = {name: _merged(values, other.covariates[name], known) for name, values in self.covariates.items()}
-        mine, theirs = vars(self.geometry), vars(other.geometry)
-        pairs = {name: _merged(values, theirs[name], known) for name, values in mine.items() if values is not None}
+
+        def merged(mine: dict[str, Any], theirs: dict[str, Any]) -> dict[str, Any]:
+            found = {name: values.copy() for name, values in mine.items() if values is not None}
+            for name, values in found.items():
+                values[known] = theirs[name]
+            return found
+
+        columns = {name: getattr(self, name) for name in ("value", "sigma", "unit_m", "pose_jacobian", "wall_xy")}
+        covariates = merged(self.covariates, other.covariates)
         geometry: Any = self.geometry
-        return replace(self, **columns, geometry=replace(geometry, **pairs))
-
-
-def _merged(mine: NDArray[Any], theirs: NDArray[Any], known: BoolArray) -> NDArray[Any]:
-    """Return (n, ...) values in which the rows `known` are replaced by `theirs`."""
-    found = mine.copy()
-    found[known] = theirs
-    return found
+        geometry = replace(geometry, **merged(vars(geometry), vars(other.geometry)))
+        return replace(self, **merged(columns, vars(other)), covariates=covariates, geometry=geometry)
 
 
 @dataclass(frozen=True)
@@ -261,15 +224,14 @@ class ExpectedPulses:
     """
 
     lost: BoolArray
-    covariates: dict[str, FloatArray] = field(default_factory=dict)
-    wall_xy: FloatArray = field(default_factory=lambda: np.empty((0, 2)))
+    covariates: dict[str, FloatArray]
+    wall_xy: FloatArray
 
 
 def range_derivative(normal: FloatArray, direction: FloatArray, moved: FloatArray, distance: FloatArray) -> FloatArray:
-    """Return how the range along a ray to a plane changes as the ray turns, for first-order effects of angle errors.
+    """Return how the range along a ray to a plane changes as the ray turns, (n,), m/rad: -t (du·n) / (u·n).
 
-    The plane goes through a point p, and the ray starts at o. With the range t = (p - o)·n / (u·n), the derivative is
-    dt = -t (du·n) / (u·n).
+    This is the derivative of the range t = (p - o)·n / (u·n) from o to a plane through p.
 
     Parameters
     ----------
@@ -277,9 +239,5 @@ def range_derivative(normal: FloatArray, direction: FloatArray, moved: FloatArra
     direction : (n, 3) unit directions u of the rays, same frame.
     moved : (n, 3) derivative du of the direction by the turning angle, per rad.
     distance : (n,) ranges t, m.
-
-    Returns
-    -------
-    (n,) derivative of the range, m/rad.
     """
     return -distance * np.einsum("ni,ni->n", moved, normal) / np.einsum("ni,ni->n", direction, normal)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -17,8 +17,8 @@ from scene.ray_casting.upload import on_device
 from sensors.effects.base import ShowsIn
 from sensors.laser.tls import LaserScanner, Pattern, ScannerConfig
 from sensors.models.sensor_model import TlsModel, TlsNoise
-from sensors.signal_chain.beam import Echo, Mode, SubRays
-from sensors.signal_chain.pulses import PulseGeometry, Pulses, direction
+from sensors.signal_chain.beam import Beam, Echo, Mode, SubRays
+from sensors.signal_chain.pulses import Pulses, direction
 
 _NO_NOISE = TlsNoise(range_sigma_m=0.0, range_ppm=0.0, angle_sigma_rad=0.0)
 
@@ -29,29 +29,23 @@ class DirectedScanner(LaserScanner):
 
     Attributes
     ----------
-    geometry : Directions of the n pulses. If it contains received powers or scan lines and times, these are used in the
-        simulation.
+    geometry : Directions of the n pulses. Received powers, scan lines and times that it contains are used in the simulation.
+        For a reference surface of noisy points, its `bulge_m` corrects the ranges for the curvature between the points, and its
+        `plane_normal` has the planes on which turned rays hit.
     inclined : Whether the incidence angles of `geometry` are used instead of those to the triangles of the reference surface.
-    between : For a reference surface of noisy points: geometry of the same n rays. Its field `bulge_m` corrects the ranges for
-        the curvature between the points, and `plane_normal` has the planes on which turned rays hit. None: no correction.
     """
 
-    geometry: PulseGeometry = field(kw_only=True)
+    geometry: RayGeometry = field(kw_only=True)
     inclined: bool = False
-    between: RayGeometry | None = None
 
     def emit(self) -> Pulses:
         """Return one pulse for each direction of `geometry`, before any error, as the input of the scanner simulation."""
-        angles, count = self.geometry, len(self.geometry.azimuth)
-        index = dr.arange(mi.UInt32, count)
-        zero = np.zeros(count)
-        line = zero if angles.line is None else np.maximum(angles.line, 0)
-        share = zero if angles.share is None else angles.share
+        angles, zero = self.geometry, np.zeros(len(self.geometry))
+        index = dr.arange(mi.UInt32, len(angles))
         azimuth, zenith = (on_device(mi.Float64, angle) for angle in (angles.azimuth, angles.zenith))
-        number = on_device(mi.UInt32, line)
         return Pulses(
-            line=number,
-            share=on_device(mi.Float64, share),
+            line=on_device(mi.UInt32, zero if angles.line is None else np.maximum(angles.line, 0)),
+            share=on_device(mi.Float64, zero if angles.share is None else angles.share),
             line_key=index * 0,
             pulse_key=index,
             azimuth=azimuth,
@@ -60,88 +54,31 @@ class DirectedScanner(LaserScanner):
             aim_zenith=zenith,
         )
 
-    def ranges(self, scene: RayCaster, random: KeyedRandom) -> FloatArray:
-        """Simulate the ranges that the scanner records for all its n pulses.
-
-        Parameters
-        ----------
-        scene : The reference surface, wall frame, prepared for ray tracing.
-        random : Source of the random numbers.
-
-        Returns
-        -------
-        (n,) ranges, m; NaN without a return.
-        """
-        pulses, beam = self.emitted(self.emit(), random)
-        return self._recorded_ranges(pulses, self.echo(scene, self._traced_pulses(pulses), beam, beam.combine_echoes), random)
-
-    def ranges_by_mode(self, scene: RayCaster, random: KeyedRandom, modes: Sequence[Mode]) -> dict[Mode, FloatArray]:
-        """Simulate the recorded ranges for several ways in which a scanner may combine the echoes within one beam.
-
-        A beam that meets a depth step returns several echoes. It is simulated by sub-rays over its footprint, which are traced
-        only once for all ways.
-
-        Parameters
-        ----------
-        scene : The reference surface, wall frame, prepared for ray tracing.
-        random : Source of the random numbers.
-        modes : Ways to combine the echoes into one range: strongest, mean or first.
-
-        Returns
-        -------
-        For each mode the (n,) ranges, m; NaN without a return.
-        """
-        pulses, beam = self.emitted(self.emit(), random)
-        parts: dict[Mode, list[Echo]] = {mode: [] for mode in modes}
-
-        def merge(rays: SubRays) -> Echo:
-            for mode in modes:
-                echo = replace(beam, mode=mode).combine_echoes(rays)
-                dr.eval(echo)
-                parts[mode].append(echo)
-            return echo
-
-        self.echo(scene, self._traced_pulses(pulses), beam, merge)
-        return {mode: self._recorded_ranges(pulses, Echo.joined(parts[mode]), random) for mode in modes}
-
-    def _traced_pulses(self, pulses: Pulses) -> Pulses:
-        """The pulses in their recorded directions if deflections are followed along planes; else unchanged."""
-        return pulses if self._planes is None else replace(pulses, aim_azimuth=pulses.azimuth, aim_zenith=pulses.zenith)
-
-    def _recorded_ranges(self, pulses: Pulses, echo: Echo, random: KeyedRandom) -> FloatArray:
-        """(n,) ranges of echoes after the effects on measured values, m; NaN without a return."""
-        pulses = self.measured(pulses, echo, random)
-        return np.array(dr.select(pulses.returned, pulses.range_m, np.nan))
+    def echo(self, scene: RayCaster, pulses: Pulses, beam: Beam, merge: Callable[[SubRays], Echo]) -> Echo:
+        """Trace the beams (see `LaserScanner.echo`): in their recorded directions, if deflections are followed along planes."""
+        if self.geometry.plane_normal is not None:
+            pulses = replace(pulses, aim_azimuth=pulses.azimuth, aim_zenith=pulses.zenith)
+        return super().echo(scene, pulses, beam, merge)
 
     def measured(self, pulses: Pulses, echo: Echo, random: KeyedRandom) -> Pulses:
-        """Apply the errors that arise when an echo is recorded, such as range noise or a bias that depends on the intensity.
+        """Apply the errors that arise when an echo is recorded, such as range noise (see `LaserScanner.measured`).
 
         Known recorded intensities and incidence angles of the measured scan replace the simulated ones. Ranges are corrected
         for the curvature of the surface between the reference's vertices, where it is known.
-
-        Parameters
-        ----------
-        pulses : The pulses as emitted.
-        echo : What returned from the surface for each pulse.
-        random : Source of the random numbers.
-
-        Returns
-        -------
-        The pulses with their recorded values.
         """
         known = {"power": self.geometry.power, "cos_incidence": self.geometry.cos_incidence if self.inclined else None}
         known = {name: on_device(mi.Float32, np.maximum(each, 1e-9)) for name, each in known.items() if each is not None}
         echo = replace(echo, **known)
-        if self.between is not None and self.between.bulge_m is not None:
-            echo = replace(echo, range_m=echo.range_m - on_device(mi.Float64, np.nan_to_num(self.between.bulge_m)))
-        if self._planes is not None:
-            echo = replace(echo, range_m=echo.range_m * _deflection_ratio(pulses, self._planes))
+        if self.geometry.bulge_m is not None:
+            echo = replace(echo, range_m=echo.range_m - on_device(mi.Float64, np.nan_to_num(self.geometry.bulge_m)))
+        if self.geometry.plane_normal is not None:
+            echo = replace(echo, range_m=echo.range_m * _deflection_ratio(pulses, self.geometry.plane_normal))
         return super().measured(pulses, echo, random)
 
-    @property
-    def _planes(self) -> FloatArray | None:
-        """(n, 3) normals of the planes along which deflected pulses are followed; None: along the reference's triangles."""
-        return None if self.between is None else self.between.plane_normal
+    def ranges(self, pulses: Pulses, echo: Echo, random: KeyedRandom) -> FloatArray:
+        """Return the ranges (n,) that are recorded from the echoes of pulses, m; NaN without a return."""
+        pulses = self.measured(pulses, echo, random)
+        return np.array(dr.select(pulses.returned, pulses.range_m, np.nan))
 
 
 def _deflection_ratio(pulses: Pulses, normal: FloatArray) -> mi.Float64:
@@ -151,15 +88,12 @@ def _deflection_ratio(pulses: Pulses, normal: FloatArray) -> mi.Float64:
     return dr.dot(across, nominal) / dr.dot(across, real)
 
 
-def _scanner(
-    measurement: TlsMeasurement, model: TlsModel, geometry: PulseGeometry, between: RayGeometry | None = None
-) -> DirectedScanner:
+def _scanner(measurement: TlsMeasurement, model: TlsModel, geometry: RayGeometry) -> DirectedScanner:
     """The scanner of a measurement with another model."""
-    position, rotation = measurement.station
-    pattern = Pattern(0.0, 1.0, len(geometry.azimuth), 0.0, 1.0, 1)
+    pattern = Pattern(0.0, 1.0, len(geometry), 0.0, 1.0, 1)
     config = ScannerConfig(minimum_range_m=0.01, maximum_range_m=1e5)
     inclined = measurement.planes is not None
-    return DirectedScanner(position, rotation, pattern, config, model, geometry=geometry, inclined=inclined, between=between)
+    return DirectedScanner(*measurement.station, pattern, config, model, geometry=geometry, inclined=inclined)
 
 
 def simulate_ranges(measurement: TlsMeasurement, model: TlsModel, geometry: RayGeometry, random: KeyedRandom) -> FloatArray:
@@ -176,7 +110,9 @@ def simulate_ranges(measurement: TlsMeasurement, model: TlsModel, geometry: RayG
     -------
     (n,) ranges, m; NaN without a return.
     """
-    return _scanner(measurement, model, geometry, geometry).ranges(measurement.scene, random)
+    scanner = _scanner(measurement, model, geometry)
+    pulses, beam = scanner.emitted(scanner.emit(), random)
+    return scanner.ranges(pulses, scanner.echo(measurement.scene, pulses, beam, beam.combine_echoes), random)
 
 
 def simulate_ranges_by_mode(
@@ -184,21 +120,32 @@ def simulate_ranges_by_mode(
 ) -> dict[Mode, FloatArray]:
     """Simulate the ranges of a scanner with a wide beam, for several ways in which it may combine the echoes within one beam.
 
-    It serves to find out which way the scanner uses at depth steps.
+    It serves to find out which way the scanner uses at depth steps, where a beam returns several echoes. The sub-rays over the
+    beam's footprint are traced only once for all ways.
 
     Parameters
     ----------
-    measurement : The scan, with the scanner's pose and the reference surface.
+    measurement, geometry, random : As in `simulate_ranges`.
     model : The sensor model, which states the width of the beam.
     modes : Ways to combine the echoes into one range: strongest, mean or first.
-    geometry : The n measured rays.
-    random : Source of the random numbers.
 
     Returns
     -------
     For each mode the (n,) ranges, m; NaN without a return.
     """
-    return _scanner(measurement, model, geometry, geometry).ranges_by_mode(measurement.scene, random, modes)
+    scanner = _scanner(measurement, model, geometry)
+    pulses, beam = scanner.emitted(scanner.emit(), random)
+    parts: dict[Mode, list[Echo]] = {mode: [] for mode in modes}
+
+    def merge(rays: SubRays) -> Echo:
+        for mode in modes:
+            echo = replace(beam, mode=mode).combine_echoes(rays)
+            dr.eval(echo)
+            parts[mode].append(echo)
+        return echo
+
+    scanner.echo(measurement.scene, pulses, beam, merge)
+    return {mode: scanner.ranges(pulses, Echo.joined(parts[mode]), random) for mode in modes}
 
 
 def systematic_part(model: TlsModel) -> TlsModel:
@@ -210,19 +157,10 @@ def systematic_part(model: TlsModel) -> TlsModel:
     return model.model_copy(update={"noise": _NO_NOISE, "effects": kept})
 
 
-def mean_beam_directions(measurement: TlsMeasurement, geometry: PulseGeometry) -> tuple[FloatArray, FloatArray]:
-    """Predict in which directions the beams really left, given the errors of axes and angles in the sensor model.
+def mean_beam_directions(measurement: TlsMeasurement, geometry: RayGeometry) -> tuple[FloatArray, FloatArray]:
+    """Predict in which directions the beams really left, given the errors of axes and angles in a scan's sensor model.
 
-    Noise is not included.
-
-    Parameters
-    ----------
-    measurement : The scan with its sensor model.
-    geometry : The n recorded directions.
-
-    Returns
-    -------
-    (n,) azimuth and (n,) zenith angle, rad, scanner frame.
+    Noise is not included. geometry: the n recorded directions. Returns azimuth (n,) and zenith angle (n,), rad, scanner frame.
     """
     scanner = _scanner(measurement, systematic_part(measurement.model), geometry)
     pulses = scanner.emitted(scanner.emit(), KeyedRandom(0, ("gap", "mean")))[0]
@@ -230,15 +168,8 @@ def mean_beam_directions(measurement: TlsMeasurement, geometry: PulseGeometry) -
 
 
 def predict_ranges(measurement: TlsMeasurement, geometry: RayGeometry) -> FloatArray:
-    """Predict the mean ranges along measured rays under the measurement's sensor model, by a simulation without noise.
+    """Predict the mean ranges (n,) along n measured rays, m, by a simulation without noise; NaN without a return.
 
-    Parameters
-    ----------
-    measurement : The scan, with the scanner's pose, the reference surface and the sensor model.
-    geometry : The n measured rays.
-
-    Returns
-    -------
-    (n,) ranges, m; NaN without a return.
+    measurement: the scan, with the scanner's pose, the reference surface and the sensor model.
     """
     return simulate_ranges(measurement, systematic_part(measurement.model), geometry, KeyedRandom(0, ("gap", "mean")))

@@ -40,8 +40,8 @@ from pipeline.gap.thresholds import thresholds
 from scene.geometry.frame import WallFrame
 from scene.geometry.mesh import FloatArray
 
-Pairs = tuple[NDArray[np.int64], NDArray[np.int64]]
-"""Rows of the first and of the second point of pairs of neighbours."""
+Pairs = NDArray[np.int64]
+"""Row numbers (2, k) of the two points of k pairs of neighbours."""
 
 _LEVELS = (2.5, 4.0, 8.0)
 """Levels in sigmas above which points form components."""
@@ -99,8 +99,8 @@ class SceneChange:
         frame: the wall frame of the measurement, which converts to the world frame.
         """
         world = frame.to_world(self.corners)
-        return {"bbox_m": [*world.min(axis=0).tolist(), *world.max(axis=0).tolist()], "volume_m3": self.volume_m3,
-                "volume_std_m3": self.volume_std_m3}  # fmt: skip
+        box = [*world.min(axis=0).tolist(), *world.max(axis=0).tolist()]
+        return {"bbox_m": box, "volume_m3": self.volume_m3, "volume_std_m3": self.volume_std_m3}
 
 
 def find_scene_changes(residuals: Residuals, view: SensorView, eligible: BoolArray) -> tuple[list[SceneChange], BoolArray]:
@@ -120,8 +120,6 @@ def find_scene_changes(residuals: Residuals, view: SensorView, eligible: BoolArr
     The changed regions, largest volume first; and (n,) true for points in such a region or within three point spacings of one.
     """
     beside = np.zeros(len(residuals), dtype=bool)
-    departure, error = np.zeros(len(residuals)), np.zeros((2, len(residuals)))
-    label = np.full(len(residuals), -1)
     if eligible.sum() < NEIGHBOURS:
         return [], beside
     for _ in range(_ROUNDS):
@@ -135,8 +133,7 @@ def find_scene_changes(residuals: Residuals, view: SensorView, eligible: BoolArr
         faint = medians / np.maximum(scatter, _LEAST_MEDIAN_STD)
         faint[np.abs(medians) * residuals.sigma * residuals.unit_m < thresholds().points.reference_error] = 0.0
         label, limit = _components(z, faint, view, eligible)
-        members = np.flatnonzero(label >= 0)
-        beside = view.near(members, thresholds().changes.margin) if len(members) else np.zeros(len(residuals), dtype=bool)
+        beside = view.near(np.flatnonzero(label >= 0), thresholds().changes.margin)
         if not (beside & ~before).any():
             break
     limited = departure * np.minimum(1.0, limit / np.maximum(np.abs(z), 1e-12))
@@ -184,20 +181,19 @@ def moved_share(residuals: Residuals, view: SensorView, eligible: BoolArray) -> 
 def _components(z: FloatArray, faint: FloatArray, view: SensorView, eligible: BoolArray) -> tuple[NDArray[np.int64], FloatArray]:
     """Number of the change that contains each point (n,), -1 for none, and the sigmas (n,) that its neighbours confirm.
 
-    `z`: (n,) standardised residuals; `faint`: (n,) standardised medians of neighbours.
+    z: (n,) standardised residuals. faint: (n,) standardised medians of neighbours.
     """
     exceeds = np.abs(faint) > thresholds().changes.faint_sigmas
     side = np.where(exceeds, np.sign(faint), np.sign(z)) * (exceeds | (np.abs(z) > _LEVELS[0]))
-    first, second = view.neighbour_pairs(np.flatnonzero(side))
-    together = side[first] * side[second] > 0
-    pairs, size = (first[together], second[together]), np.abs(z)
+    pairs, size = view.neighbour_pairs(np.flatnonzero(side)), np.abs(z)
+    pairs = pairs[:, side[pairs[0]] * side[pairs[1]] > 0]
     least = max(thresholds().points.registration_outlier_sigmas, _correlated_sigmas(z, view, eligible))
     core = _faint_cores(faint, exceeds, pairs, eligible)
     for sign, level, ratio in product((1.0, -1.0), _LEVELS, _RATIOS):
         core |= _significant(sign * z, level, ratio, pairs, eligible, least)
     whole = _extended(core, size, pairs, eligible)
     label = _compact(_connected(whole, pairs), int(eligible.sum()))
-    inside = _select_pairs(pairs, whole[pairs[0]] & whole[pairs[1]])
+    inside = pairs[:, whole[pairs].all(axis=0)]
     most = np.zeros(len(z))
     for one, other in (inside, inside[::-1]):
         np.maximum.at(most, one, size[other])
@@ -215,8 +211,8 @@ def _faint_cores(faint: FloatArray, exceeds: BoolArray, pairs: Pairs, eligible: 
 
 def _agreeing(pairs: Pairs, size: FloatArray, ratio: float) -> Pairs:
     """The pairs whose standardised residuals (n,) agree."""
-    one, other = size[pairs[0]], size[pairs[1]]
-    return _select_pairs(pairs, np.maximum(one, other) <= _agreement_limit(np.minimum(one, other), ratio))
+    sizes = size[pairs]
+    return pairs[:, sizes.max(axis=0) <= _agreement_limit(sizes.min(axis=0), ratio)]
 
 
 def _agreement_limit(size: FloatArray, ratio: float) -> FloatArray:
@@ -247,20 +243,12 @@ def _significant(z: FloatArray, level: float, ratio: float, pairs: Pairs, eligib
 
 
 def _log_expected(count: NDArray[np.int64], points: int, stray: int, agreeing: float) -> FloatArray:
-    """Return log E(m), the logarithm of the number of components of m points expected by chance.
+    """Return log E(m), the logarithm of the number of components of m points expected by chance, for sizes m (k,).
 
-    Parameters
-    ----------
-    count : (k,) m, the number of points of each component.
-    points : Number of points searched.
-    stray : How many of them exceed the level by chance.
-    agreeing : Share of pairs of values that agree.
+    points: number N of points searched. stray: how many of them exceed the level by chance. agreeing: share c of pairs of values
+    that agree.
     """
-    shapes = np.where(
-        count <= len(_SHAPES),
-        _SHAPES[np.minimum(count, len(_SHAPES)) - 1],
-        _SHAPES[-1] + _GROWTH * (count - len(_SHAPES)),
-    )
+    shapes = _SHAPES[np.minimum(count, len(_SHAPES)) - 1] + _GROWTH * np.maximum(count - len(_SHAPES), 0)
     share = np.log(max(stray, 1) / points)
     return np.asarray(np.log(points) + shapes + count * share + (count - 1) * np.log(agreeing))
 
@@ -307,17 +295,12 @@ def _connected(chosen: BoolArray, pairs: Pairs) -> NDArray[np.int64]:
     rows = np.flatnonzero(chosen)
     number = np.full(len(chosen), -1)
     number[rows] = np.arange(len(rows))
-    one, other = (number[each] for each in _select_pairs(pairs, chosen[pairs[0]] & chosen[pairs[1]]))
+    one, other = number[pairs[:, chosen[pairs].all(axis=0)]]
     graph = coo_array((np.ones(len(one), dtype=np.int8), (one, other)), shape=(len(rows), len(rows)))
     label = np.full(len(chosen), -1)
     if len(rows):
         label[rows] = connected_components(graph, directed=False)[1]
     return label
-
-
-def _select_pairs(pairs: Pairs, which: BoolArray) -> Pairs:
-    """Some of the pairs."""
-    return pairs[0][which], pairs[1][which]
 
 
 def _compact(label: NDArray[np.int64], points: int) -> NDArray[np.int64]:
@@ -332,8 +315,6 @@ def _measure_changes(label: NDArray[np.int64], departure: FloatArray, error: Flo
     error: (2, n) independent and common standard deviation of each ray's residual, m.
     """
     rows = np.flatnonzero(label >= 0)
-    if not len(rows):
-        return []
     solid = view.solid_angles(rows)
     near, far = view.reference_m[rows], view.range_at_residual(rows, departure[rows])
     volume = (far**3 - near**3) / 3 * solid
@@ -341,9 +322,9 @@ def _measure_changes(label: NDArray[np.int64], departure: FloatArray, error: Flo
     width = 0.5 * np.sqrt(area)
     own, common = error[:, rows] * area
     surfaces = [view.points_at(rows, each) for each in (near, far)]
-    order = np.argsort(label[rows], kind="stable")
     found = []
-    for part in np.split(order, np.flatnonzero(np.diff(label[rows][order])) + 1):
+    for number in np.unique(label[rows]):
+        part = np.flatnonzero(label[rows] == number)
         corners = np.concatenate([_box(surface[part], width[part]) for surface in surfaces])
         moved = float(np.median((far - near)[part]))
         epochs = view.epoch[rows[part]]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property, partial
 
 import numpy as np
@@ -11,7 +11,7 @@ from scipy.spatial import Delaunay, cKDTree
 
 from pipeline.formats.measurements.measurement import Measurement, StereoMeasurement, SurfaceMeasurement, TlsMeasurement
 from pipeline.gap.residuals.nominal_pair import NominalPair
-from pipeline.gap.residuals.residuals import Residuals, Rows
+from pipeline.gap.residuals.residuals import Residuals, Rows, select_rows
 from pipeline.gap.residuals.stereo_residuals import StereoResiduals
 from pipeline.gap.residuals.surface_residuals import SurfaceResiduals
 from pipeline.gap.residuals.tls_residuals import TlsResiduals
@@ -44,15 +44,15 @@ class SensorView:
 
     Attributes
     ----------
-    coordinates : (n, 2) position in the field of view: azimuth and zenith, rad, or column and row, px, or along and up the
-        wall, m. Each of several scans is shifted by a constant, so that points of different scans are not neighbours.
+    coordinates : (n, 2) position in the field of view, as `Geometry.sensor_coordinates`. Each of several scans is shifted by a
+        constant, so that points of different scans are not neighbours.
     epoch : (n,) number of the epoch (the repetition of the measurement) of each point.
-    origin : (3,) origin of the rays, or (n, 3) for several scans, wall frame, m.
+    origin : (n, 3) origin of the rays, wall frame, m.
     ray : (n, 3) unit directions of the rays, wall frame.
     reference_m : (n,) range to the reference surface along the rays, m.
     disparity : (n,) disparity of the reference minus that of a point at infinity, px; None if ranges were measured.
     slant : (n,) change of range per metre of residual, for a cloud without cameras, whose rays are assumed to come from a
-        distant place in front of the wall; None for other measurements.
+        distant place in front of the wall; None for other measurements, where it is 1.
     """
 
     coordinates: FloatArray
@@ -65,19 +65,10 @@ class SensorView:
 
     @classmethod
     def of(cls, measurement: Measurement, residuals: Residuals) -> SensorView:
-        """Collect rays, ranges and field-of-view positions of a measurement's points, to find and measure changes of the rock.
+        """Collect rays, ranges and field-of-view positions of n points of a measurement, given by their residuals.
 
-        The rays of a stereo pair start at its left camera.
-
-        Parameters
-        ----------
-        measurement : The measurement.
-        residuals : Residuals of the n points to describe.
-
-        Raises
-        ------
-        TypeError
-            If the residuals are of another kind of sensor than the measurement.
+        The rays of a stereo pair start at its left camera. Raises TypeError if the residuals are of another kind of sensor than
+        the measurement.
         """
         origin, reference, disparity, slant = measurement.viewpoint, None, None, None
         match measurement, residuals:
@@ -85,7 +76,8 @@ class SensorView:
                 towards = pixels.point - origin
                 disparity = pixels.disparity - NominalPair.of(measurement).geometry.offset
             case TlsMeasurement(), TlsResiduals(geometry=rays):
-                origin = _origins(measurement, residuals.index) if measurement.scans else origin
+                if measurement.scans:
+                    origin = np.stack([scan.pose[0] for scan in measurement.scans])[measurement.scan_of[residuals.index]]
                 towards, reference = measurement.cloud.points[residuals.index] - origin, rays.range_m
             case SurfaceMeasurement(), SurfaceResiduals(geometry=places):
                 origin = measurement.centre + _FROM_AFAR * (origin - measurement.centre)
@@ -97,59 +89,27 @@ class SensorView:
         if isinstance(measurement, TlsMeasurement) and measurement.scans:
             plane = _side_by_side(plane, measurement.scan_of[residuals.index])
         reference = length if reference is None else reference
+        origin = np.broadcast_to(origin, towards.shape)
         return cls(plane, epoch, origin, towards / length[:, None], reference, disparity, slant)
 
     def part(self, rows: Rows) -> SensorView:
-        """Return the view (rays and field-of-view positions) of a subset of the n points.
-
-        rows: row numbers, a mask (n,) or a slice.
-        """
-        return replace(
-            self,
-            coordinates=self.coordinates[rows],
-            epoch=self.epoch[rows],
-            ray=self.ray[rows],
-            origin=self.origin if self.origin.ndim == 1 else self.origin[rows],
-            reference_m=self.reference_m[rows],
-            disparity=None if self.disparity is None else self.disparity[rows],
-            slant=None if self.slant is None else self.slant[rows],
-        )
+        """Return the view of a subset of the n points, given as row numbers, a mask (n,) or a slice."""
+        return select_rows(self, rows)
 
     def range_at_residual(self, rows: NDArray[np.int64], residual: FloatArray) -> FloatArray:
-        """Convert residuals of points to ranges, to locate a surface that differs from the reference.
+        """Convert residuals (m,) of points with row numbers `rows` (m,) to ranges from the sensor (m,), m.
 
-        A disparity residual r changes the range R of the reference to R d / (d + r), where d is the reference's disparity minus
-        that at infinity.
-
-        Parameters
-        ----------
-        rows : (m,) row numbers of the points.
-        residual : (m,) their residuals (measured minus predicted): m of range or of distance, or px of disparity.
-
-        Returns
-        -------
-        (m,) ranges from the sensor, m.
+        They locate a surface that differs from the reference. A disparity residual r changes the range R of the reference to
+        R d / (d + r), where d is the reference's disparity minus that at infinity.
         """
-        if self.slant is not None:
-            return np.asarray(self.reference_m[rows] + residual * self.slant[rows])
-        if self.disparity is None:
-            return np.asarray(self.reference_m[rows] + residual)
-        return np.asarray(self.reference_m[rows] * self.disparity[rows] / (self.disparity[rows] + residual))
+        reference = self.reference_m[rows]
+        if self.disparity is not None:
+            return np.asarray(reference * self.disparity[rows] / (self.disparity[rows] + residual))
+        return np.asarray(reference + (residual if self.slant is None else residual * self.slant[rows]))
 
     def points_at(self, rows: NDArray[np.int64], range_m: FloatArray) -> FloatArray:
-        """Convert ranges on the rays of some points to positions, to outline a surface that differs from the reference.
-
-        Parameters
-        ----------
-        rows : (m,) row numbers of the points.
-        range_m : (m,) ranges from the sensor, m.
-
-        Returns
-        -------
-        (m, 3) positions, wall frame, m.
-        """
-        origin = self.origin if self.origin.ndim == 1 else self.origin[rows]
-        return np.asarray(origin + range_m[:, None] * self.ray[rows])
+        """Convert ranges (m,), m, on the rays of points with row numbers `rows` (m,) to positions (m, 3), wall frame, m."""
+        return np.asarray(self.origin[rows] + range_m[:, None] * self.ray[rows])
 
     @cached_property
     def scaled_coordinates(self) -> FloatArray:
@@ -173,51 +133,31 @@ class SensorView:
         groups = [np.flatnonzero(self.epoch == number) for number in np.unique(self.epoch)]
         return [(rows, cKDTree(self.scaled_coordinates[rows])) for rows in groups]
 
-    def neighbour_pairs(self, rows: NDArray[np.int64], count: int = NEIGHBOURS) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    def neighbour_pairs(self, rows: NDArray[np.int64]) -> NDArray[np.int64]:
         """Pair points with their neighbours in the sensor's field of view, to find connected groups of points.
 
-        Neighbours are the nearest points of the same epoch (repetition of the measurement) within three point spacings, and the
-        point at the same place in the next epoch.
+        Neighbours are the eight nearest points of the same epoch (repetition of the measurement) within three point spacings, and
+        the point at the same place in the next epoch.
 
-        Parameters
-        ----------
-        rows : Row numbers of the points whose neighbours are wanted.
-        count : Largest number of neighbours of each point in its own epoch.
-
-        Returns
-        -------
-        (k,) and (k,) row numbers of the first and of the second point of k pairs.
+        rows: row numbers of the points whose neighbours are wanted. Returns the row numbers of both points of k pairs, (2, k).
         """
-        pairs = [np.empty((2, 0), dtype=np.int64)]
+        found = [np.empty((2, 0), dtype=np.int64)]
         wanted = np.zeros(len(self.coordinates), dtype=bool)
         wanted[rows] = True
-        for number, (group, tree) in enumerate(self._trees):
+        for number, (group, _) in enumerate(self._trees):
             own = group[wanted[group]]
-            pairs.append(
-                _pairs_from_query(
-                    own, group, *tree.query(self.scaled_coordinates[own], count + 1, distance_upper_bound=_FARTHEST)
-                )
-            )
-            if number + 1 < len(self._trees):
-                following, other = self._trees[number + 1]
-                pairs.append(
-                    _pairs_from_query(own, following, *other.query(self.scaled_coordinates[own], [1], distance_upper_bound=1.0))
-                )
-        first, second = np.concatenate(pairs, axis=1)
-        return first[first != second], second[first != second]
+            searches = ((_FARTHEST, list(range(1, NEIGHBOURS + 2))), (1.0, [1]))  # in the same epoch, and in the next one
+            for (others, tree), (farthest, nearest) in zip(self._trees[number : number + 2], searches, strict=False):
+                distance, position = tree.query(self.scaled_coordinates[own], nearest, distance_upper_bound=farthest)
+                hit = np.isfinite(distance)
+                found.append(np.stack([np.repeat(own, hit.sum(axis=1)), others[position[hit]]]))
+        pairs = np.concatenate(found, axis=1)
+        return pairs[:, pairs[0] != pairs[1]]
 
     def neighbour_median(self, z: FloatArray) -> FloatArray:
-        """Return the median of values over each point and its eight nearest neighbours, to find changes that neighbours share.
+        """Return the median (n,) of values z (n,) over each point and its eight nearest neighbours in the field of view.
 
-        Single outliers hardly influence it. Neighbours are those in the sensor's field of view.
-
-        Parameters
-        ----------
-        z : (n,) values of the points, such as standardised residuals.
-
-        Returns
-        -------
-        (n,) medians, in the unit of the values.
+        It shows changes that neighbours share, and single outliers hardly influence it.
         """
         found = np.empty(len(z))
         for group, near in self._rings:
@@ -229,45 +169,26 @@ class SensorView:
     @cached_property
     def _rings(self) -> list[tuple[NDArray[np.int64], NDArray[np.int32]]]:
         """For each epoch the rows of its points, and for each point itself and its neighbours, numbered among those rows."""
-        counts = [min(NEIGHBOURS + 1, len(group)) for group, _ in self._trees]
         return [
-            (group, tree.query(self.scaled_coordinates[group], count, workers=-1)[1].astype(np.int32))
-            for (group, tree), count in zip(self._trees, counts, strict=True)
+            (group, tree.query(self.scaled_coordinates[group], min(NEIGHBOURS + 1, len(group)), workers=-1)[1].astype(np.int32))
+            for group, tree in self._trees
         ]
 
     def near(self, rows: NDArray[np.int64], spacings: float) -> NDArray[np.bool_]:
         """Tell which points lie near chosen ones in the sensor's field of view, to set aside the surroundings of a change.
 
-        Points of all epochs (repetitions of the measurement) are compared.
-
-        Parameters
-        ----------
-        rows : Row numbers of the points near which others are wanted.
-        spacings : Largest distance in the field of view, in spacings of neighbouring points.
-
-        Returns
-        -------
-        (n,) true for points within this distance of any of those in `rows`, and for these themselves.
+        rows: row numbers of the chosen points. spacings: largest distance, in spacings of neighbouring points. Returns true (n,)
+        for points of any epoch within this distance of a chosen one, and for these themselves.
         """
-        distance = cKDTree(self.scaled_coordinates[rows]).query(
-            self.scaled_coordinates, distance_upper_bound=spacings, workers=-1
-        )[0]
-        return np.asarray(np.isfinite(distance))
+        tree = cKDTree(self.scaled_coordinates[rows])
+        return np.isfinite(tree.query(self.scaled_coordinates, distance_upper_bound=spacings, workers=-1)[0])
 
     def solid_angles(self, rows: NDArray[np.int64]) -> FloatArray:
-        """Compute the solid angle that each of some points represents, to turn changes of range into volumes.
+        """Compute the solid angle (m,), sr, that each of some points represents, to turn changes of range into volumes.
 
-        The points of each epoch (repetition) are joined to Delaunay triangles in the sensor's field of view, and a third of the
-        solid angle of a triangle goes to each corner. Points beside lost returns thus represent these too. A triangle across a
-        gap counts at most four times the median triangle.
-
-        Parameters
-        ----------
-        rows : (m,) row numbers of the points.
-
-        Returns
-        -------
-        (m,) solid angles, sr.
+        The points of each epoch are joined to Delaunay triangles in the sensor's field of view, and a third of the solid angle of
+        a triangle goes to each corner. Points beside lost returns thus represent these too. A triangle across a gap counts at
+        most four times the median triangle. rows: (m,) row numbers of the points.
         """
         total = np.zeros(len(self.coordinates))
         wanted = np.zeros(len(self.coordinates), dtype=bool)
@@ -291,11 +212,6 @@ def _medians_of(values: FloatArray, rows: NDArray[np.int32]) -> FloatArray:
     return np.asarray(np.median(values[rows], axis=1))
 
 
-def _origins(measurement: TlsMeasurement, index: NDArray[np.int64]) -> FloatArray:
-    """(n, 3) origins of the rays of points of several scans, m."""
-    return np.stack([scan.pose[0] for scan in measurement.scans])[measurement.scan_of[index]]
-
-
 def _side_by_side(plane: FloatArray, scan: NDArray[np.int64]) -> FloatArray:
     """(n, 2) coordinates with the scans side by side, so that points of different scans are never neighbours."""
     found, start = plane.copy(), 0.0
@@ -316,11 +232,3 @@ def _axis_spacings(plane: FloatArray) -> FloatArray:
     along = [np.where(offset[..., axis] >= offset[..., 1 - axis], offset[..., axis], np.inf).min(axis=1) for axis in (0, 1)]
     found = np.median(along, axis=1)
     return np.where(np.isfinite(found), np.maximum(found, 1e-12), offset.max())
-
-
-def _pairs_from_query(
-    own: NDArray[np.int64], group: NDArray[np.int64], distance: FloatArray, position: NDArray[np.int64]
-) -> NDArray[np.int64]:
-    """(2, k) pairs of the points `own` and of those that a tree of `group` found for them."""
-    hit = np.isfinite(distance)
-    return np.stack([np.repeat(own, hit.sum(axis=1)), group[position[hit]]])

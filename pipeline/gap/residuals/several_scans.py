@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import fields, replace
 from typing import Any
 
 import numpy as np
 
 from pipeline.formats.measurements.measurement import TlsMeasurement
+from pipeline.gap.residuals.ray_hits import RayGeometry
+from pipeline.gap.residuals.residuals import POINT_COLUMNS
 from pipeline.gap.residuals.scan_simulation import simulate_ranges
 from pipeline.gap.residuals.tls_residuals import TlsResiduals, tls_residuals
 from scene.common.keyed_random import KeyedRandom
@@ -19,8 +20,7 @@ from sensors.models.sensor_model import TlsModel
 def residuals_of_scans(measurement: TlsMeasurement) -> TlsResiduals:
     """Compute the range residuals (measured minus predicted ranges) of a measurement that consists of several laser scans.
 
-    All scans share the sensor model. The points keep the order of the measurement. The pose Jacobian is (n, 6 k), with six
-    columns (shift in m, rotation in rad) for each of k set-ups (positions of the scanner).
+    All scans share the sensor model. The points keep the order of the measurement, and the covariates that all scans have.
     """
     count = 1 + max((scan.set_up for scan in measurement.scans), default=0)
     parts = []
@@ -29,23 +29,16 @@ def residuals_of_scans(measurement: TlsMeasurement) -> TlsResiduals:
         pose = np.zeros((len(found), 6 * count))
         pose[:, 6 * scan.set_up : 6 * scan.set_up + 6] = found.pose_jacobian
         parts.append(replace(found, pose_jacobian=pose, index=rows[found.index]))
-    whole = _concatenated(parts)
-    return whole.part(np.argsort(whole.index, kind="stable"))
-
-
-def _concatenated(parts: Sequence[TlsResiduals]) -> TlsResiduals:
-    """Concatenate residuals, with the covariates that all of them have."""
-    arrays = ("value", "sigma", "unit_m", "usable", "on_smooth_surface", "pose_jacobian", "wall_xy", "index")
-    columns: dict[str, Any] = {name: np.concatenate([getattr(part, name) for part in parts]) for name in arrays}
+    columns: dict[str, Any] = {name: np.concatenate([getattr(part, name) for part in parts]) for name in POINT_COLUMNS}
     shared = [name for name in parts[0].covariates if all(name in part.covariates for part in parts)]
     columns["covariates"] = {name: np.concatenate([part.covariates[name] for part in parts]) for name in shared}
-    geometries = [part.geometry for part in parts]
     pulses: dict[str, Any] = {}
-    for field in fields(geometries[0]):
-        values = [getattr(each, field.name) for each in geometries]
+    for field in fields(parts[0].geometry):
+        values = [getattr(part.geometry, field.name) for part in parts]
         pulses[field.name] = None if any(value is None for value in values) else np.concatenate(values)
     notes = tuple(dict.fromkeys(note for part in parts for note in part.notes))
-    return replace(parts[0], **columns, geometry=replace(geometries[0], **pulses), notes=notes)
+    whole = replace(parts[0], **columns, geometry=RayGeometry(**pulses), notes=notes)
+    return whole.part(np.argsort(whole.index, kind="stable"))
 
 
 def simulate_range_errors(

@@ -52,14 +52,14 @@ def standardize(residuals: Residuals, view_xy: FloatArray, unchanged: NDArray[np
 
 
 def nmad_along_covariates(residuals: Residuals, z: FloatArray, unchanged: NDArray[np.bool_]) -> FloatArray:
-    """Estimate at each point how much larger the residuals' scatter is than predicted.
+    """Estimate at each of n points how much larger the residuals' scatter is than predicted.
 
     The points are sorted into bins of each covariate, such as range or incidence angle. The robust standard deviation (NMAD) of
     each bin is computed.
 
     Parameters
     ----------
-    residuals : Residuals of n points with their covariates.
+    residuals : The residuals, of which only the covariates count.
     z : (n,) residuals divided by their predicted standard deviations.
     unchanged : (n,) true for points where the rock did not change, from which the NMADs are computed.
 
@@ -83,40 +83,26 @@ def _local_median(view_xy: FloatArray, value: FloatArray, unchanged: NDArray[np.
     side = float(np.ptp(view_xy, axis=0).max()) / _CELLS or 1.0
     shape = tuple(int(extent / side) + 1 for extent in np.ptp(view_xy, axis=0))
     place = (view_xy - low) / side
-    cell = np.ravel_multi_index(tuple(np.minimum(place[:, axis].astype(np.int64), shape[axis] - 1) for axis in (0, 1)), shape)
+    cell = np.ravel_multi_index(tuple(place.astype(np.int64).T), shape, mode="clip")
     middle = group_medians(value[unchanged], cell[unchanged], int(np.prod(shape)), _FEWEST).reshape(shape)
     padded = np.pad(middle, _WINDOW // 2, constant_values=np.nan)
     windows = np.lib.stride_tricks.sliding_window_view(padded, (_WINDOW, _WINDOW)).reshape(-1, _WINDOW**2)
-    empty = np.isnan(windows).all(axis=1)
-    smooth = np.full(len(windows), np.nanmedian(middle) if np.isfinite(middle).any() else np.nan)
-    smooth[~empty] = np.nanmedian(windows[~empty], axis=1)
-    smooth = smooth.reshape(shape)
-    return np.asarray(ndimage.map_coordinates(smooth, (place - 0.5).T, order=1, mode="nearest"))
+    known = np.isfinite(windows).any(axis=1)
+    smooth = np.full(len(windows), np.nanmedian(middle) if known.any() else np.nan)
+    smooth[known] = np.nanmedian(windows[known], axis=1)
+    return np.asarray(ndimage.map_coordinates(smooth.reshape(shape), (place - 0.5).T, order=1, mode="nearest"))
 
 
 def group_medians(value: FloatArray, cell: NDArray[np.int64], count: int, fewest: int) -> FloatArray:
-    """Return the median of each group of values, such as the residuals of the points in each cell of a raster.
+    """Return the median of each of `count` groups of values, such as the residuals of the points in each cell of a raster.
 
-    Parameters
-    ----------
-    value : (n,) values.
-    cell : (n,) number of the group to which each value belongs, from 0 to count - 1.
-    count : Number of groups.
-    fewest : Groups with fewer values get NaN.
-
-    Returns
-    -------
-    (count,) medians.
+    cell: (n,) number of the group to which each of the values (n,) belongs, counted from 0. Groups with fewer values than
+    `fewest` get NaN.
     """
-    order = np.lexsort((value, cell))
-    ordered = value[order]
-    sizes = np.bincount(cell, minlength=count)
-    starts = np.cumsum(sizes) - sizes
-    filled = sizes >= fewest
-    low, high = starts[filled] + (sizes[filled] - 1) // 2, starts[filled] + sizes[filled] // 2
-    found = np.full(count, np.nan)
-    found[filled] = (ordered[low] + ordered[high]) / 2
-    return found
+    if not len(value):
+        return np.full(count, np.nan)
+    enough = np.bincount(cell, minlength=count) >= fewest
+    return np.where(enough, ndimage.median(value, cell, np.arange(count)), np.nan)
 
 
 def _nmad_along(values: FloatArray, z: FloatArray, order: NDArray[np.int32]) -> FloatArray:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from functools import reduce
 
 import numpy as np
 
@@ -21,7 +20,7 @@ from pipeline.gap.residuals.nominal_pair import (
     NominalPair,
     PixelGeometry,
     is_hidden,
-    moved_pair,
+    moved_pairs,
     pixel_rays,
     predict_disparities,
     project,
@@ -58,15 +57,7 @@ _ON_RAY = 0.1
 
 @dataclass(frozen=True)
 class StereoResiduals(Residuals):
-    """Residuals of a stereo pair: measured minus predicted disparities, px.
-
-    It has all attributes of `Residuals`: values, predicted standard deviations, mask of usable points, pose Jacobian and
-    covariates.
-
-    Attributes
-    ----------
-    geometry : The matched pixels of the points, with the places on the reference surface that they see.
-    """
+    """Residuals of a stereo pair: measured minus predicted disparities, px. See `Residuals` for the attributes."""
 
     sensor = "stereo"
     position_covariates = ("image_x", "image_y")
@@ -86,17 +77,10 @@ def move_onto_rays(left: Camera, points: FloatArray, u: FloatArray, v: FloatArra
 
     A reconstruction lies on the rays of its pixels until it is registered to other data. Measured disparities can only be
     computed from points on these rays. The motion is found by Gauss-Newton iteration from some thousand points. It is applied
-    only if it reduces the reprojection error to less than a tenth.
+    only if it reduces the reprojection error to less than a tenth; otherwise the points are returned unmoved.
 
-    Parameters
-    ----------
-    left : The left camera.
-    points : (n, 3) reconstructed points, in the frame of the camera's pose, m.
-    u, v : (n,) columns and rows at which they were matched in the left image, px.
-
-    Returns
-    -------
-    (n, 3) points, moved or not, m.
+    points: (n, 3), in the frame of the left camera's pose, m. u, v: (n,) columns and rows at which they were matched in the left
+    image, px.
     """
     some = slice(None, None, max(len(points) // 4000, 1))
     found, centre = RigidTransform.identity(), points.mean(axis=0)
@@ -136,8 +120,7 @@ def stereo_residuals(measurement: StereoMeasurement) -> StereoResiduals:
     geometry, depth = _reference(nominal, real, measurement.scene, u, v, measured)
     cell_px = raster_cell_px(u, v)
     about = _surroundings(measurement, nominal, real, geometry, depth, cell_px or 1.0)
-    along_row, along_column = about.gradient.T
-    geometry = replace(geometry, along_row=along_row, along_column=along_column)
+    geometry = replace(geometry, along_row=about.gradient[:, 0], along_column=about.gradient[:, 1])
     geometry = replace(geometry, shaped=_shaped_px(measurement, geometry))
     hit = np.isfinite(geometry.disparity)
     px_per_m = nominal.geometry.f * nominal.geometry.base_m / depth**2
@@ -155,7 +138,7 @@ def stereo_residuals(measurement: StereoMeasurement) -> StereoResiduals:
         covariates=covariates,
         index=np.arange(len(u)),
         geometry=geometry,
-        correlated_noise=GridCorrelatedNoise.of(model, np.stack([u, v], axis=1)),
+        correlated_noise=GridCorrelatedNoise(pixels=np.stack([u, v], axis=1)).with_effects(model.matching_noise),
         notes=(*measurement.notes, *_notes(_has_pixels(measurement), u, v, cell_px)),
     )
     return whole if hit.all() else whole.part(hit)
@@ -164,21 +147,12 @@ def stereo_residuals(measurement: StereoMeasurement) -> StereoResiduals:
 def with_surroundings(measurement: StereoMeasurement, found: StereoResiduals) -> StereoMeasurement:
     """Store in a stereo measurement what the rock is like around the place that each pixel sees, to save tracing it again.
 
-    Stored are depth steps and visibility from the right camera. They stay valid for small moves of the cameras. After a large
-    move the visibility is wrong at a few points beside edges.
-
-    Parameters
-    ----------
-    measurement : The stereo pair.
-    found : Its residuals, from which these properties are taken.
-
-    Returns
-    -------
-    The measurement with the stored properties.
+    Stored are depth steps and visibility from the right camera, as the residuals `found` have them. They stay valid for small
+    moves of the cameras. After a large move the visibility is wrong at a few points beside edges.
     """
-    edge = found.covariates["edge_step"]
-    at = found.geometry
-    about = Surroundings(at.point, edge, ~found.on_smooth_surface & (edge < _EDGE_PX), at.gradient)
+    edge, at = found.covariates["edge_step"], found.geometry
+    gradient = np.asarray([at.along_row, at.along_column]).T
+    about = Surroundings(at.point, edge, ~found.on_smooth_surface & (edge < _EDGE_PX), gradient)
     everywhere = Surroundings.nowhere(len(measurement.cloud.points))
     return measurement.changed(surroundings=everywhere.changed(found.index, about))
 
@@ -213,11 +187,11 @@ def _reference(
     nominal: NominalPair, real: CameraPair, scene: RayCaster, u: FloatArray, v: FloatArray, measured: FloatArray
 ) -> tuple[PixelGeometry, FloatArray]:
     """What the pixels of the `real` cameras see: their geometry on the reference, and the depth (n,), m."""
-    left, camera = real.left, real.right
+    left = real.left
     ray = pixel_rays(left, u, v)
     distance, face = scene.cast(left.position, ray)
     point = left.position + distance[:, None] * ray
-    right, normal = project(camera, point), scene.mesh.normals[np.maximum(face, 0)]
+    right = project(real.right, point)
     geometry = PixelGeometry(
         u=u,
         v=v,
@@ -225,9 +199,8 @@ def _reference(
         disparity=nominal.disparity((u, v), right),
         found=measured,
         point=point,
-        normal=normal,
+        normal=scene.mesh.normals[np.maximum(face, 0)],
         radius=np.hypot(u - left.width / 2, v - left.height / 2),
-        radius_right=np.hypot(right[0] - camera.width / 2, right[1] - camera.height / 2),
         tangent=nominal.tangent(u, v),
         infinity=np.full(len(u), nominal.geometry.offset),
         shaped=np.zeros(len(u)),
@@ -280,16 +253,13 @@ def _edge_px(nominal: NominalPair, left: Camera, scene: RayCaster, geometry: Pix
     height = np.einsum("ni,ni->n", geometry.point - left.position, geometry.normal)
     beside = _four_neighbours(geometry, _PROBE_PX)
     step = nominal.geometry.f * nominal.geometry.base_m * steps_from_planes(scene, left, *beside, height, geometry.normal)
-    return reduce(np.maximum, np.fmin(np.abs(step), _MOST_EDGE_PX).T)
+    return np.asarray(np.fmin(np.abs(step), _MOST_EDGE_PX).max(axis=1))
 
 
 def _pose_jacobian(nominal: NominalPair, geometry: PixelGeometry) -> FloatArray:
     """(n, 6) derivatives of the disparity by a shift (m) and a rotation (rad) of both cameras about the left one, wall frame."""
-    centre, step = nominal.pair.left.position, 1e-4
-    units = step * np.eye(3)
-    moved = [moved_pair(nominal.pair, centre, unit, turned=turned) for turned in (False, True) for unit in units]
-    base, *columns = predict_disparities(nominal, [nominal.pair, *moved], geometry)
-    return np.stack([(column - base) / step for column in columns], axis=1)
+    base, *columns = predict_disparities(nominal, [nominal.pair, *moved_pairs(nominal.pair, _NUDGE)], geometry)
+    return np.stack([(column - base) / _NUDGE for column in columns], axis=1)
 
 
 def _systematic_error(model: StereoModel, geometry: PixelGeometry) -> FloatArray:

@@ -98,10 +98,6 @@ def estimate_surface_noise(measurement: SurfaceMeasurement, where: str) -> Surfa
     measurement : The cloud (without cameras) with its reference surface.
     where : Name of the input file or folder, for the error message.
 
-    Returns
-    -------
-    The standard deviations of white noise and of grid-correlated noise.
-
     Raises
     ------
     InputError
@@ -129,33 +125,28 @@ def _fit_noise(points: FloatArray, value: FloatArray) -> SurfaceNoise:
     lag, gamma, weight = _semivariogram(points, value, spacing)
     root = np.sqrt(weight) / gamma  # the standard error of a variance is proportional to it
     slow = (lag / lag.max()) ** 2
-    best = None
-    without_nodes = _nonnegative_fit(np.stack([np.ones(len(lag)), slow], axis=1), gamma, root)
-    for step in _STEPS:
-        form = np.stack([np.ones(len(lag)), _node_semivariogram(lag / step), slow], axis=1)
-        found = _nonnegative_fit(form, gamma, root)
-        if best is None or found[1] < best[1][1]:
-            best = step, found
-    step, (values, square) = best if best is not None else (1.0, without_nodes)
+
+    def fit(*columns: FloatArray) -> tuple[FloatArray, float]:
+        """Coefficients of at least 0 of these columns and of slow variation, by weighted least squares, and chi²."""
+        values, left = nnls(np.stack([*columns, slow], axis=1) * root[:, None], gamma * root)
+        return values, float(left**2)
+
+    white = np.ones(len(lag))
+    without, simple = fit(white)
+    fits = [(step, *fit(white, _node_semivariogram(lag / step))) for step in _STEPS]
+    step, values, square = min(fits, key=lambda each: each[2])
     shared = 4 / 9 * values[1]
-    improves = without_nodes[1] - square > 2 * thresholds().variance.least_gain
+    improves = simple - square > 2 * thresholds().variance.least_gain
     if not improves or shared < thresholds().variance.least_excess * values[0]:
-        return SurfaceNoise(float(np.sqrt(without_nodes[0][0])), 0.0, 0.1, spacing, 0.0)
+        return SurfaceNoise(float(np.sqrt(without[0])), 0.0, 0.1, spacing, 0.0)
     own = max(values[0], 1e-4 * shared)
     return SurfaceNoise(float(np.sqrt(own)), float(np.sqrt(values[1])), step * spacing, spacing, float(shared / (own + shared)))
 
 
-def _nonnegative_fit(form: FloatArray, gamma: FloatArray, root: FloatArray) -> tuple[FloatArray, float]:
-    """Weighted least squares with coefficients of at least 0; returns them and chi²."""
-    values, left = nnls(form * root[:, None], gamma * root)
-    return values, float(left**2)
-
-
 def _node_semivariogram(lag: FloatArray) -> FloatArray:
     """(k,) semivariogram of nodes with variance 1, averaged over directions, at lags (k,) in node spacings."""
-    return np.mean(
-        [node_semivariogram(np.stack([lag * np.cos(angle), lag * np.sin(angle)], axis=1)) for angle in _DIRECTIONS], axis=0
-    )
+    along = np.stack([np.cos(_DIRECTIONS), np.sin(_DIRECTIONS)], axis=1)
+    return np.mean([node_semivariogram(lag[:, None] * each) for each in along], axis=0)
 
 
 def _semivariogram(points: FloatArray, value: FloatArray, spacing: float) -> tuple[FloatArray, FloatArray, FloatArray]:

@@ -12,13 +12,14 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from pipeline.formats.measurements.measurement import SurfaceMeasurement
 from pipeline.formats.measurements.surface_datum import datum_columns
 from pipeline.formats.measurements.surface_fit import near_m
 from pipeline.gap.residuals.correlated_noise import GridCorrelatedNoise
-from pipeline.gap.residuals.residuals import BoolArray, Residuals, Rows
-from pipeline.gap.residuals.wall_blocks import BlockGrid
+from pipeline.gap.residuals.residuals import BoolArray, Residuals
+from pipeline.gap.residuals.wall_blocks import wall_blocks_by_points
 from scene.common.keyed_random import KeyedRandom
 from scene.geometry.mesh import FloatArray
 from sensors.effects import Effects
@@ -53,8 +54,7 @@ _ROUNDING = 1e-6
 class SurfaceGeometry(SurfacePlaces):
     """Geometry of n points of a cloud without cameras: the place on the reference surface below each, and the distance to it.
 
-    The place is described by the fields of `SurfacePlaces`: point, normal, roughness, convexity and distance to the nearest
-    edge.
+    The place is described by the fields of `SurfacePlaces`.
 
     Attributes
     ----------
@@ -65,15 +65,8 @@ class SurfaceGeometry(SurfacePlaces):
 
     @property
     def sensor_coordinates(self) -> FloatArray:
-        """(n, 2) positions along the wall and up the wall, m.
-
-        They stand for the position in the field of view, because the cameras are unknown.
-        """
+        """(n, 2) positions along and up the wall, m, which stand for those in the field of view of the unknown cameras."""
         return np.asarray(self.point[:, :2])
-
-    def part(self, rows: Rows) -> SurfaceGeometry:
-        """Return the geometry of a subset of the n points, given as row numbers, a mask or a slice."""
-        return super().part(rows)
 
 
 @dataclass(frozen=True)
@@ -84,7 +77,6 @@ class SurfaceResiduals(Residuals):
 
     Attributes
     ----------
-    geometry : For each point the place on the reference below it.
     pose_jacobian : (n, k) derivatives of the distances by the cloud's position, orientation and scale (its datum). There is a
         column for each of the k combinations of shift, rotation and scale that the relief of the reference can determine. It is
         evaluated at the places on the reference, because the noise of the points would bias the scale.
@@ -106,10 +98,7 @@ class SurfaceResiduals(Residuals):
 
     @property
     def candidates(self) -> Effects:
-        """The effects (error terms) by which the residuals of a cloud without cameras may be explained, as classes.
-
-        These are only kinds of noise of the points, in metres: all other effects need the cameras.
-        """
+        """Classes of the effects that may explain the residuals: only noise of the points, as all others need the cameras."""
         return (PointNoise,)
 
 
@@ -122,37 +111,39 @@ def surface_residuals(measurement: SurfaceMeasurement) -> SurfaceResiduals:
     points, model = measurement.cloud.points, measurement.model
     spacing = point_spacing_m(points)
     geometry, triangle, across = _hits_along_normals(measurement, points)
-    sigma = np.sqrt(sum((effect.variance(geometry) for effect in model.of_points()), np.zeros(len(points))))
-    mean = sum((effect.mean(geometry) for effect in model.of_points()), np.zeros(len(points)))
-    hit = np.isfinite(geometry.departure)
+    index = np.flatnonzero(np.isfinite(geometry.departure))
+    geometry, triangle, across = geometry.part(index), triangle[index], across[index]
+    sigma = predicted_sigma(model, geometry)
+    mean = sum((effect.mean(geometry) for effect in model.of_points()), np.zeros(len(index)))
     bend = _bend(measurement, geometry.point, triangle, geometry.normal, spacing)
-    even = hit & (bend < np.maximum(_EDGE_SIGMAS * sigma, _EDGE_SLOPE * spacing))
-    even &= _rim_distance(measurement, geometry.point) > _FROM_RIM * spacing
-    whole = SurfaceResiduals(
+    even = bend < np.maximum(_EDGE_SIGMAS * sigma, _EDGE_SLOPE * spacing)
+    if len(rim := measurement.shape.rim):
+        distance = cKDTree(measurement.reference.vertices[rim]).query(geometry.point, workers=-1)[0]
+        even &= distance > _FROM_RIM * spacing
+    return SurfaceResiduals(
         value=geometry.departure - mean,
         sigma=sigma,
-        unit_m=np.ones(len(points)),
-        usable=even & measurement.stable,
+        unit_m=np.ones(len(index)),
+        usable=even & measurement.stable[index],
         on_smooth_surface=even,
         pose_jacobian=-datum_columns(geometry.point - measurement.centre, triangle) @ measurement.datum / across[:, None],
         wall_xy=geometry.point[:, :2],
-        covariates=_varying_covariates(geometry, hit, measurement),
-        index=np.arange(len(points)),
+        covariates=_varying_covariates(geometry, measurement),
+        index=index,
         geometry=geometry,
         datum=measurement.datum,
         correlated_noise=_correlated_noise(model, geometry.point[:, :2], spacing),
         notes=(*measurement.notes, NO_CAMERAS, *(() if measurement.datum[6].any() else (NO_SCALE,))),
     )
-    return whole.part(hit)
 
 
-def _varying_covariates(geometry: SurfaceGeometry, hit: BoolArray, measurement: SurfaceMeasurement) -> dict[str, FloatArray]:
+def _varying_covariates(geometry: SurfaceGeometry, measurement: SurfaceMeasurement) -> dict[str, FloatArray]:
     """The covariates that vary by more than rounding errors."""
     extent = float(np.linalg.norm(np.ptp(measurement.reference.bounds, axis=0)))
     return {
         name: values
         for name, values in geometry.covariates.items()
-        if name in SurfaceResiduals.position_covariates or (hit.any() and float(np.ptp(values[hit])) > _ROUNDING * extent)
+        if name in SurfaceResiduals.position_covariates or (len(values) and float(np.ptp(values)) > _ROUNDING * extent)
     }
 
 
@@ -161,8 +152,6 @@ def point_spacing_m(points: FloatArray) -> float:
 
     points: (n, 3), m. With fewer than two points the result is 0.
     """
-    from scipy.spatial import cKDTree
-
     if len(points) < 2:
         return 0.0
     some = points[:: max(len(points) // 2000, 1)]
@@ -191,40 +180,22 @@ def _hits_along_normals(measurement: SurfaceMeasurement, points: FloatArray) -> 
     distance = np.where(met, distance, np.nan)
     corners = scene.mesh.faces[face].astype(np.int64)
     places = shape.at(points - distance[:, None] * normal, corners)
-    known = {name: getattr(places, name) for name in ("point", "normal", "roughness", "convexity", "edge_distance")}
-    return SurfaceGeometry(**known, departure=distance), triangle, np.where(met, across, 1.0)
+    return SurfaceGeometry(**vars(places), departure=distance), triangle, np.where(met, across, 1.0)
 
 
 def _bend(
     measurement: SurfaceMeasurement, point: FloatArray, triangle: FloatArray, normal: FloatArray, spacing: float
 ) -> FloatArray:
     """(n,) largest deviation of the reference from the hit triangle's plane at four places one point spacing away, m."""
-    known = np.isfinite(point).all(axis=1)
-    bend = np.full(len(point), np.inf)
-    at, plane, direction = point[known], triangle[known], normal[known]
-    first = np.cross(direction, np.where(np.abs(direction[:, :1]) < 0.9, [[1.0, 0.0, 0.0]], [[0.0, 1.0, 0.0]]))
+    first = np.cross(normal, np.where(np.abs(normal[:, :1]) < 0.9, [[1.0, 0.0, 0.0]], [[0.0, 1.0, 0.0]]))
     first /= np.linalg.norm(first, axis=1, keepdims=True)
-    second, found = np.cross(direction, first), np.zeros(len(at))
-    lift = 5 * spacing
+    second, bend = np.cross(normal, first), np.zeros(len(point))
     for aside in (first, -first, second, -second):
-        beside = at + spacing * aside
-        distance = measurement.scene.cast(beside + lift * direction, -direction)[0]
-        flat = np.einsum("ni,ni->n", plane, beside + lift * direction - at) / np.einsum("ni,ni->n", plane, direction)
-        found = np.maximum(found, np.nan_to_num(np.abs(distance - flat), nan=np.inf))
-    bend[known] = found
+        start = point + spacing * aside + 5 * spacing * normal
+        distance = measurement.scene.cast(start, -normal)[0]
+        flat = np.einsum("ni,ni->n", triangle, start - point) / np.einsum("ni,ni->n", triangle, normal)
+        bend = np.maximum(bend, np.nan_to_num(np.abs(distance - flat), nan=np.inf))
     return bend
-
-
-def _rim_distance(measurement: SurfaceMeasurement, point: FloatArray) -> FloatArray:
-    """(n,) distance from the reference's open border, m; infinite if it has none."""
-    from scipy.spatial import cKDTree
-
-    rim = measurement.shape.rim
-    known = np.isfinite(point).all(axis=1)
-    distance = np.where(known, np.inf, 0.0)
-    if len(rim):
-        distance[known] = cKDTree(measurement.reference.vertices[rim]).query(point[known], workers=-1)[0]
-    return distance
 
 
 def _correlated_noise(model: StereoModel, at: FloatArray, spacing: float) -> GridCorrelatedNoise:
@@ -235,32 +206,21 @@ def _correlated_noise(model: StereoModel, at: FloatArray, spacing: float) -> Gri
 
 
 def simulate_distances(model: StereoModel, residuals: SurfaceResiduals, random: KeyedRandom) -> FloatArray:
-    """Simulate the distances from the reference surface that the points of a cloud have under a sensor model.
+    """Simulate the distances (n,), m, of a cloud's points from the reference under a sensor model, positive out of the rock.
 
-    Parameters
-    ----------
-    model : The sensor model to simulate.
-    residuals : Residuals of n points, with the place on the reference below each.
-    random : Source of the random numbers.
-
-    Returns
-    -------
-    (n,) distances along the normal, m, positive out of the rock.
+    residuals: residuals of the n points, with the place on the reference below each. random: source of the random numbers.
     """
     start = RecordedPoints(residuals.geometry, np.zeros(len(residuals)))
     return apply_stage(model.of_points(), Stage.POINT, start, random).above
 
 
-def predicted_sigma(model: StereoModel, residuals: SurfaceResiduals) -> FloatArray:
-    """Return the (n,) standard deviations of a cloud's distances from the reference that a sensor model predicts, m.
-
-    model: the sensor model. residuals: residuals of the n points, with the place on the reference below each.
-    """
-    return np.sqrt(sum((effect.variance(residuals.geometry) for effect in model.of_points()), np.zeros(len(residuals))))
+def predicted_sigma(model: StereoModel, places: SurfaceGeometry) -> FloatArray:
+    """Return the standard deviations (n,), m, of n points' distances from the reference that a sensor model predicts."""
+    return np.sqrt(sum((effect.variance(places) for effect in model.of_points()), np.zeros(len(places))))
 
 
 def datum_covariance(residuals: SurfaceResiduals, value: FloatArray, rows: BoolArray) -> FloatArray:
-    """Estimate the covariance of a cloud's datum (shift, rotation and scale) by a jackknife over squares of the wall.
+    """Estimate the covariance (7, 7) of a cloud's shift (m), rotation (rad) and scale by a jackknife over squares of the wall.
 
     The wall is divided into about thirty squares. Each is left out in turn, as a whole, because errors are correlated within
     it. Without square b the datum changes by -(A - A_b)⁻¹ r_b. A is the normal matrix of the alignment; A_b and r_b are what
@@ -271,20 +231,15 @@ def datum_covariance(residuals: SurfaceResiduals, value: FloatArray, rows: BoolA
     residuals : Residuals of the n points of the cloud.
     value : (n,) distances from the reference after the alignment, m.
     rows : (n,) true for points by which the cloud was aligned.
-
-    Returns
-    -------
-    (7, 7) covariance of shift (m), rotation (rad) and scale.
     """
     part, left = residuals.part(rows), value[rows]
-    extent = np.ptp(part.wall_xy, axis=0)
-    blocks = BlockGrid(part.wall_xy.min(axis=0), float(np.sqrt(np.prod(extent) / _JACKKNIFE_CELLS)))
-    _, number = np.unique(blocks.numbers(part.wall_xy), return_inverse=True)
-    scale = np.linalg.norm(part.pose_jacobian / part.sigma[:, None], axis=0)
-    columns = part.pose_jacobian / part.sigma[:, None] / scale
+    number = wall_blocks_by_points(part.wall_xy, len(left) / _JACKKNIFE_CELLS)
+    columns = part.pose_jacobian / part.sigma[:, None]
+    scale = np.linalg.norm(columns, axis=0)
+    columns = columns / scale
     whole = columns.T @ columns
     changes = []
-    for each in range(int(number.max()) + 1):
+    for each in np.unique(number):
         own = number == each
         matrix = whole - columns[own].T @ columns[own]
         changes.append(-np.linalg.lstsq(matrix, columns[own].T @ (left[own] / part.sigma[own]), rcond=None)[0] / scale)

@@ -21,7 +21,6 @@ from sensors.effects.range_empirical import RangeEmpirical
 from sensors.effects.range_noise import RangeNoise
 from sensors.models.sensor_model import TlsModel
 from sensors.signal_chain.polar import polar, polar_axes
-from sensors.signal_chain.pulses import PulseGeometry
 
 _EDGE_SIGMAS = 3.0
 """A surface that deviates from its triangle's plane by more sigmas within a beam's width counts as an edge."""
@@ -35,14 +34,10 @@ _LEAST_POWER = 1e-9
 
 @dataclass(frozen=True)
 class TlsResiduals(Residuals):
-    """Residuals of a laser scan: measured minus predicted ranges, m.
-
-    It has all attributes of `Residuals`: values, predicted standard deviations, mask of usable points, pose Jacobian and
-    covariates.
+    """Residuals of a laser scan: measured minus predicted ranges, m. See `Residuals` for the other attributes.
 
     Attributes
     ----------
-    geometry : The rays of the points.
     reference_error_m : Standard deviation along the rays of the errors of the reference surface's vertices, m. Each vertex has
         an error of its own. 0: the vertices have no such errors.
     error_is_relief : Whether these errors stand mostly for relief between the vertices. They are then independent from ray to
@@ -65,12 +60,10 @@ class TlsResiduals(Residuals):
 
     @property
     def with_sigma_of_means(self) -> Self:
-        """Return the residuals with a `sigma` that is right for means over many neighbouring points.
+        """Return the residuals with a `sigma` that is right for means over many neighbouring points (see `Residuals`).
 
-        Divided by sqrt(k), the new sigma (n,), m, is the standard deviation of a mean of k neighbours. The sigma of single
-        points would give too small a value: neighbouring rays hit triangles of the reference with common vertices, and the
-        errors of these vertices do not average out. If the vertices have no errors of their own, the residuals are returned
-        unchanged.
+        The sigma of single points would be too small: neighbouring rays hit triangles of the reference with common vertices, and
+        the errors of these vertices do not average out.
         """
         corner, weight = self.geometry.corner, self.geometry.weight
         if not self.reference_error_m or self.error_is_relief or corner is None or weight is None:
@@ -80,18 +73,9 @@ class TlsResiduals(Residuals):
         return replace(self, sigma=np.sqrt(variance))
 
     def reference_covariance_with(self, other: NDArray[np.int64]) -> FloatArray:
-        """Return the covariance of each ray's residual with that of another ray due to errors of the reference's vertices.
+        """Return the covariance (n,), m², of each ray's residual with that of another ray, `other` (n,) (see `Residuals`).
 
-        Rays share such errors if they hit triangles with common vertices. It is needed for the variance of differences of
-        neighbouring residuals.
-
-        Parameters
-        ----------
-        other : (n,) for each ray the row number of the other ray.
-
-        Returns
-        -------
-        (n,) covariances, m²; 0 without common vertices.
+        Rays share errors of the reference if they hit triangles with common vertices.
         """
         corner, weight = self.geometry.corner, self.geometry.weight
         if not self.reference_error_m or corner is None or weight is None:
@@ -130,7 +114,7 @@ def tls_residuals(measurement: TlsMeasurement) -> TlsResiduals:
     intensity = measurement.cloud.intensity
     real = azimuth, zenith
     if any(effect.stage == Stage.AIM for effect in model.effects):
-        real = mean_beam_directions(measurement, PulseGeometry(azimuth, zenith, line=line, share=share, power=intensity))
+        real = mean_beam_directions(measurement, RayGeometry(azimuth, zenith, line=line, share=share, power=intensity))
     axes = [np.einsum("ij,nj->ni", rotation, vectors) for vectors in polar_axes(*real)]
     along_planes = measurement.planes is not None and measurement.planes.noise_dominates
     if along_planes:
@@ -218,24 +202,11 @@ def _assembled(parts: list[tuple[NDArray[np.int64], FloatArray | None]], count: 
     return found
 
 
-def log_over_median(power: FloatArray) -> FloatArray:
-    """Return the logarithm of received powers relative to their median, as a covariate for errors that depend on the intensity.
-
-    power: (n,) received powers, in any unit. Returns (n,) natural logarithms.
-    """
-    positive = np.maximum(power, 1e-12)
-    return np.asarray(np.log(positive / np.median(positive)), dtype=np.float64)
-
-
 def recorded_polar(measurement: TlsMeasurement) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return the directions and ranges that the scanner recorded for the n points of a scan.
+    """Return what the scanner recorded for n points: azimuth without jumps by 2 π, zenith angle, and range, (n,) each.
 
-    Angles follow the face in which the instrument measured: in face 2 the zenith angle is 2 π minus that of face 1, and the
-    azimuth is larger by π.
-
-    Returns
-    -------
-    (n,) azimuth without jumps by 2 π, (n,) zenith angle, both in rad in the scanner frame, and (n,) range, m.
+    Angles are in rad in the scanner frame, ranges in m. Angles follow the face in which the instrument measured: in face 2 the
+    zenith angle is 2 π minus that of face 1, and the azimuth is larger by π.
     """
     position, rotation = measurement.station
     local = np.einsum("ji,nj->ni", rotation, measurement.cloud.points - position)
@@ -280,9 +251,7 @@ def _shares_of_duration(time: FloatArray, epochs: NDArray[np.int64]) -> FloatArr
 def _scan_lines(pattern: ScanPattern | None, azimuth: FloatArray) -> FloatArray | None:
     """(n,) scan line of each azimuth; None if the azimuths lie on no raster."""
     if pattern is not None:
-        start, _, step = pattern.azimuth_rad
-        turn = 2 * np.pi * np.round((azimuth.mean() - start - (pattern.azimuth_rad[1] - start) / 2) / (2 * np.pi))
-        return np.asarray(np.rint((azimuth - turn - start) / step), dtype=np.float64)
+        return _line_number(pattern, azimuth)
     gaps = np.diff(np.sort(azimuth))
     wide = gaps[gaps > _SHORTEST_STEP_RAD]
     if len(wide) < 10 or len(wide) > 0.2 * len(azimuth):
@@ -291,7 +260,7 @@ def _scan_lines(pattern: ScanPattern | None, azimuth: FloatArray) -> FloatArray 
 
 
 def _covariates(geometry: RayGeometry, curvature: FloatArray) -> dict[str, FloatArray]:
-    """The covariates of a range by name: angles, range, and intensity, line and time where they were recorded."""
+    """The covariates of a range by name; log intensity over its median, line and time only where they were recorded."""
     found = {
         "range": geometry.range_m,
         "azimuth": geometry.azimuth,
@@ -300,7 +269,7 @@ def _covariates(geometry: RayGeometry, curvature: FloatArray) -> dict[str, Float
         "edge_step": np.minimum(curvature, 10.0),
     }
     optional = {
-        "intensity": None if geometry.power is None else log_over_median(geometry.power),
+        "intensity": None if geometry.power is None else np.log(geometry.power / np.median(geometry.power)).astype(np.float64),
         "line": geometry.line,
         "time": geometry.share,
     }
@@ -323,14 +292,8 @@ def _notes(measurement: TlsMeasurement) -> tuple[str, ...]:
 def find_expected_pulses(measurement: TlsMeasurement, residuals: TlsResiduals) -> ExpectedPulses | None:
     """List every pulse of the scan pattern that should hit the wall, and whether it returned, to explain lost returns.
 
-    Parameters
-    ----------
-    measurement : The scan, with its pattern of nominal directions.
-    residuals : Residuals of all its points.
-
-    Returns
-    -------
-    The pulses, epoch after epoch; None if the pattern is not known.
+    measurement: the scan, with its pattern of nominal directions. residuals: residuals of all its points. Returns the pulses,
+    epoch after epoch; None if the pattern is not known.
     """
     pattern = measurement.pattern
     if pattern is None:
@@ -359,29 +322,27 @@ def find_expected_pulses(measurement: TlsMeasurement, residuals: TlsResiduals) -
 
 def pulse_count(pattern: ScanPattern) -> int:
     """Return the number of pulses of a scan pattern, to know how many returns to expect: scan lines times pulses in a line."""
-    return int(np.prod([len(sweep) for sweep in _sweeps(pattern)]))
+    lines, pulses = _sweeps(pattern)
+    return len(lines) * len(pulses)
 
 
 def pulse_number(pattern: ScanPattern, azimuth: FloatArray, zenith: FloatArray) -> NDArray[np.int64]:
     """Find the pulse of the scan pattern whose nominal direction is nearest to each recorded one, to detect lost returns.
 
-    Parameters
-    ----------
-    pattern : The scan pattern, a raster of azimuths (one scan line each) and zenith angles.
-    azimuth, zenith : (n,) recorded directions, rad, scanner frame.
-
-    Returns
-    -------
-    (n,) numbers of the pulses, counted from 0, scan line by scan line.
+    azimuth, zenith: (n,) recorded directions, rad, scanner frame. Returns the numbers (n,) of the pulses, counted from 0, scan
+    line (azimuth) by scan line.
     """
-    sweeps = _sweeps(pattern)
-    turn = 2 * np.pi * np.round((azimuth.mean() - sweeps[0].mean()) / (2 * np.pi))
-    columns = (
-        np.rint((azimuth - turn - sweeps[0][0]) / pattern.azimuth_rad[2]),
-        np.rint((zenith - sweeps[1][0]) / pattern.zenith_rad[2]),
-    )
+    sweeps, (start, _, step) = _sweeps(pattern), pattern.zenith_rad
+    columns = _line_number(pattern, azimuth), np.rint((zenith - start) / step)
     line, pulse = (np.clip(column, 0, len(sweep) - 1).astype(np.int64) for column, sweep in zip(columns, sweeps, strict=True))
     return np.asarray(line * len(sweeps[1]) + pulse)
+
+
+def _line_number(pattern: ScanPattern, azimuth: FloatArray) -> FloatArray:
+    """(n,) number of the scan line that is nearest to each azimuth, which may differ by full turns from those of the pattern."""
+    start, stop, step = pattern.azimuth_rad
+    turn = 2 * np.pi * np.round((azimuth.mean() - start - (stop - start) / 2) / (2 * np.pi))
+    return np.asarray(np.rint((azimuth - turn - start) / step), dtype=np.float64)
 
 
 def _returned(pattern: ScanPattern, geometry: RayGeometry) -> BoolArray:
@@ -392,11 +353,7 @@ def _returned(pattern: ScanPattern, geometry: RayGeometry) -> BoolArray:
 
 
 def _sweeps(pattern: ScanPattern) -> list[FloatArray]:
-    """Azimuths of the scan lines, and zenith angles of the pulses in a line, rad."""
-    return [_sweep(values) for values in (pattern.azimuth_rad, pattern.zenith_rad)]
-
-
-def _sweep(values: tuple[float, float, float]) -> FloatArray:
-    """Values from start to stop, inclusive, of (start, stop, step)."""
-    start, stop, step = values
-    return np.asarray(start + step * np.arange(int(np.floor((stop - start) / step + 1e-6)) + 1), dtype=np.float64)
+    """Azimuths of the scan lines, and zenith angles of the pulses in a line, rad, from start to stop, inclusive."""
+    ranges = (pattern.azimuth_rad, pattern.zenith_rad)
+    counts = [int(np.floor((stop - start) / step + 1e-6)) + 1 for start, stop, step in ranges]
+    return [start + step * np.arange(count, dtype=np.float64) for (start, _, step), count in zip(ranges, counts, strict=True)]

@@ -87,10 +87,9 @@ class WallCells:
         _, number, counts = np.unique(BlockGrid(origin, side).numbers(at), return_inverse=True, return_counts=True)
         kept = counts >= _FEWEST_POINTS
         renumbered = np.where(kept, np.cumsum(kept) - 1, -1)[number]
-        inside = renumbered >= 0
-        total = int(kept.sum())
-        size = np.maximum(np.bincount(renumbered[inside], minlength=total), 1)
-        centre = np.stack([np.bincount(renumbered[inside], at[inside, axis], total) / size for axis in (0, 1)], axis=1)
+        inside, size = renumbered >= 0, counts[kept]
+        sums = [np.bincount(renumbered[inside], at[inside, axis], len(size)) for axis in (0, 1)]
+        centre = np.stack(sums, axis=1) / size[:, None]
         return cls(side, renumbered, centre, origin)
 
     def __len__(self) -> int:
@@ -105,14 +104,8 @@ class WallCells:
 def wall_blocks_by_points(at: FloatArray, points: float) -> NDArray[np.int64]:
     """Divide the wall into squares (wall blocks) with a wanted mean number of points, for resampling whole blocks.
 
-    Parameters
-    ----------
-    at : (n, 2) positions of the points, x along the wall and y up, wall frame, m.
-    points : Mean number of points in a wall block.
-
-    Returns
-    -------
-    (n,) number of the wall block in which each point lies, counted from 0.
+    at: (n, 2) positions of the points, x along the wall and y up, wall frame, m. Returns the number (n,) of the wall block in
+    which each point lies, counted from 0.
     """
     side = float(np.sqrt(np.prod(np.ptp(at, axis=0)) / max(len(at) / points, 1.0))) or 1.0
     return np.asarray(np.unique(BlockGrid(at.min(axis=0), side).numbers(at), return_inverse=True)[1])

@@ -32,7 +32,6 @@ from pipeline.gap.survey.survey_design import (
     SurveyDesign,
     group_by_effect,
     parameter_label,
-    view_signatures,
 )
 from pipeline.gap.survey.survey_views import Survey, SurveyView
 from scene.common.errors import InputError
@@ -113,17 +112,9 @@ class Identifiability:
         return _nameable_size(self.cosines, self.detectable_size)
 
     def best_extension(self, row: int) -> SurveyExtension:
-        """Find the additional measurement that helps most to tell one effect from all others.
+        """Return the survey with the additional measurement that tells one effect from all others at the smallest size.
 
-        With it, the effect can be told from the others at a smaller size than with any other additional measurement.
-
-        Parameters
-        ----------
-        row : Index of the effect in `names`.
-
-        Returns
-        -------
-        The survey with this additional measurement.
+        row: index of the effect in `names`.
         """
         return min(self.extensions, key=lambda extension: extension.nameable_size[row])
 
@@ -199,18 +190,14 @@ def _nameable_size(cosines: FloatArray, detectable_size: tuple[float, ...]) -> t
 
 
 def identifiability(survey: Survey, reference_error_m: float | None = None) -> Identifiability:
-    """Analyse which sensor effects (errors) a survey can detect and distinguish, and what additional measurements would add.
+    """Analyse which sensor effects (errors) a planned or measured survey can detect and distinguish.
 
-    It helps to plan a survey before fieldwork.
-
-    Parameters
-    ----------
-    survey : The planned or measured survey: what each scanner station or stereo pair sees of the wall.
-    reference_error_m : Standard deviation of the error of the reference surface, which is correlated over metres, m; None: 1 mm
-        for a laser scanner and 5 mm for a stereo pair.
+    It also tells what additional measurements would add, which helps to plan a survey before fieldwork. reference_error_m:
+    standard deviation of the error of the reference surface, which is correlated over metres, m; None: 1 mm for a laser scanner
+    and 5 mm for a stereo pair.
     """
     error = REFERENCE_ERRORS_M[survey.sensor] if reference_error_m is None else reference_error_m
-    families = group_by_effect(view_signatures(survey.views[0]))
+    families = group_by_effect(survey.views[0].signatures)
     plain = SurveyDesign.of(survey.views, families)
     seen, noise = (plain.detectable_size(sigma) for sigma in (error, 0.0))
     extensions = []
@@ -255,9 +242,10 @@ def _extended(survey: Survey) -> list[tuple[str, tuple[SurveyView, ...], KnownPo
     Measurements that would see too little of the wall are left out.
     """
     number = max(view.station for view in survey.views) + 1
+    place = "station" if survey.sensor == "tls" else "pair of exposures"
     wanted: list[Callable[[], tuple[str, SurveyView]]] = [
-        lambda: (f"a second {survey.place} at half the range", survey.moved(0.5, 0.0, number)),
-        lambda: (f"a second {survey.place} at the same range, 40 degrees aside", survey.moved(1.0, np.radians(40.0), number)),
+        lambda: (f"a second {place} at half the range", survey.moved(0.5, 0.0, number)),
+        lambda: (f"a second {place} at the same range, 40 degrees aside", survey.moved(1.0, np.radians(40.0), number)),
         lambda: survey.repeated(number),
     ]
     found: list[tuple[str, tuple[SurveyView, ...], KnownPoints | None]] = []

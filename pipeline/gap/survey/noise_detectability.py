@@ -8,11 +8,12 @@ from typing import Any
 import numpy as np
 
 from pipeline.gap.noise_and_edges.variance_model import variance_candidates
-from pipeline.gap.survey.survey_design import DETECTION_SNR, view_signatures
-from pipeline.gap.survey.survey_views import Survey, SurveyView, TlsView
+from pipeline.gap.residuals.ray_hits import RayGeometry
+from pipeline.gap.residuals.tls_residuals import TlsResiduals
+from pipeline.gap.survey.survey_design import DETECTION_SNR
+from pipeline.gap.survey.survey_views import Survey, SurveyView
 from pipeline.gap.thresholds import thresholds
 from sensors.effects import catalogue
-from sensors.effects.base import Effect
 from sensors.effects.detection_limit import DetectionLimit
 from sensors.effects.precipitation import Precipitation
 from sensors.effects.range_quantization import RangeQuantization
@@ -58,31 +59,25 @@ def noise_and_loss_effects(survey: Survey) -> tuple[NoiseOrLossEffect, ...]:
     """
     view = survey.views[0]
     found = {each.name: each for each in _variance_effects(view)}
-    if isinstance(view, TlsView):
-        found |= {each.name: each for each in (_quantisation(), _detection_limit(view), _precipitation(view))}
-    names = {f"{survey.sensor}.{effect.tag()}": effect for effect in catalogue(survey.sensor)}
-    mean = _systematic_names(view)
-    unknown = {name: NoiseOrLossEffect(name, "", np.nan, _unknown(effect)) for name, effect in names.items()}
-    return tuple(found.get(name, unknown[name]) for name in names if name not in mean)
-
-
-def _unknown(effect: type[Effect]) -> str:
-    """Why an effect has no detectable size here."""
-    return f"needs {' and '.join(effect.needs)}: gap does not test it" if effect.needs else _NO_NUMBER
-
-
-def _systematic_names(view: SurveyView) -> set[str]:
-    """Names of the systematic effects."""
-    return {f"{view.residuals.sensor}.{candidate.name}" for candidate in view_signatures(view)}
+    if isinstance(view.residuals, TlsResiduals):
+        rays, count = view.residuals.geometry, view.point_count
+        found |= {each.name: each for each in (_quantisation(), _detection_limit(rays, count), _precipitation(rays, count))}
+    systematic = {candidate.name for candidate in view.signatures}
+    others = []
+    for effect in catalogue(survey.sensor):
+        name = f"{survey.sensor}.{effect.tag()}"
+        note = f"needs {' and '.join(effect.needs)}: gap does not test it" if effect.needs else _NO_NUMBER
+        if effect.tag() not in systematic:
+            others.append(found.get(name) or NoiseOrLossEffect(name, "", np.nan, note))
+    return tuple(others)
 
 
 def _variance_effects(view: SurveyView) -> list[NoiseOrLossEffect]:
     """Effects on the variance: sigma_i² = model + theta f_i has the information sum (f_i / sigma_i²)² / 2 on theta."""
     residuals = view.residuals
-    candidates = variance_candidates(residuals)
     found: dict[str, NoiseOrLossEffect] = {}
     excess = thresholds().variance.least_excess
-    for candidate in candidates:
+    for candidate in variance_candidates(residuals):
         form = candidate.variance.sum(axis=1) / residuals.sigma**2
         information = 0.5 * float(np.sum(form**2)) * view.point_count / len(residuals)
         theta = DETECTION_SNR / np.sqrt(max(information, 1e-300))
@@ -101,23 +96,27 @@ def _quantisation() -> NoiseOrLossEffect:
     return NoiseOrLossEffect(f"tls.{RangeQuantization.tag()}", "step_m", 1e-4, note)
 
 
-def _detection_limit(view: TlsView) -> NoiseOrLossEffect:
-    """The detection limit: losing the k weakest echoes has the log-likelihood ratio k ln(1 / losses); SNR 5 means 12.5."""
-    power = view.residuals.geometry.power
-    if power is None:
-        return NoiseOrLossEffect(f"tls.{DetectionLimit.tag()}", "minimum_power", np.nan, "needs recorded powers")
-    share = 0.5 * DETECTION_SNR**2 / np.log(1 / _LOSSES) / view.point_count
-    value = float(np.quantile(power, min(max(share, 1 / len(power)), 1.0)))
-    return NoiseOrLossEffect(
-        f"tls.{DetectionLimit.tag()}", "minimum_power", value, "as soon as the weakest echoes are lost; needs the pattern"
-    )
+def _detection_limit(rays: RayGeometry, count: int) -> NoiseOrLossEffect:
+    """The detection limit: losing the k weakest echoes has the log-likelihood ratio k ln(1 / losses); SNR 5 means 12.5.
+
+    rays: a subsample of `count` rays.
+    """
+    value, note = np.nan, "needs recorded powers"
+    if rays.power is not None:
+        share = 0.5 * DETECTION_SNR**2 / np.log(1 / _LOSSES) / count
+        value = float(np.quantile(rays.power, min(max(share, 1 / len(rays)), 1.0)))
+        note = "as soon as the weakest echoes are lost; needs the pattern"
+    return NoiseOrLossEffect(f"tls.{DetectionLimit.tag()}", "minimum_power", value, note)
 
 
-def _precipitation(view: TlsView) -> NoiseOrLossEffect:
-    """Precipitation: information on beta in the share of losses p = 1 - (1 - p0) exp(-2 beta R), with p0 unknown too."""
-    distance = view.residuals.geometry.range_m
+def _precipitation(rays: RayGeometry, count: int) -> NoiseOrLossEffect:
+    """Precipitation: information on beta in the share of losses p = 1 - (1 - p0) exp(-2 beta R), with p0 unknown too.
+
+    rays: a subsample of `count` rays.
+    """
+    distance = rays.range_m
     jacobian = np.stack([2 * distance * (1 - _LOSSES), np.ones_like(distance)], axis=1)
-    weight = view.point_count / len(distance) / (_LOSSES * (1 - _LOSSES))
+    weight = count / len(distance) / (_LOSSES * (1 - _LOSSES))
     information = weight * jacobian.T @ jacobian
     rate = DETECTION_SNR * float(np.sqrt(np.linalg.inv(information)[0, 0]))
     return NoiseOrLossEffect(f"tls.{Precipitation.tag()}", "rate_per_m", rate, f"beside {100 * _LOSSES:.0f} % of other losses")

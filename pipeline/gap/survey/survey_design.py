@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from itertools import permutations
 
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve
 from scipy.spatial.distance import cdist
 
 from pipeline.gap.mean.candidates import Candidate
-from pipeline.gap.mean.signatures import systematic_candidates
 from pipeline.gap.residuals.wall_blocks import WallCells
 from pipeline.gap.survey.known_points import KnownPoints
 from pipeline.gap.survey.survey_views import SurveyView
@@ -24,16 +23,6 @@ _NULL = 1e-9
 """Relative size below which what the pose leaves of a signature counts as nothing."""
 
 
-def view_signatures(view: SurveyView) -> list[Candidate]:
-    """Compute how each systematic effect would change the observations of one scanner station or stereo pair (its signature).
-
-    An effect with parameters that cannot be fitted, such as a camera or a period, is listed once for each trial value.
-
-    view: what the station or pair sees of the wall.
-    """
-    return systematic_candidates(view.residuals, view.measurement)
-
-
 def group_by_effect(candidates: list[Candidate]) -> dict[str, list[Candidate]]:
     """Group candidates by sensor effect, and keep the few of each that show which effects a survey can distinguish.
 
@@ -41,13 +30,7 @@ def group_by_effect(candidates: list[Candidate]) -> dict[str, list[Candidate]]:
     the effect in tables. The others are kept because they may look like another effect. Of waves, only the one with the middle
     of the trial periods is kept.
 
-    Parameters
-    ----------
-    candidates : All variants of all effects, as `view_signatures` gives them.
-
-    Returns
-    -------
-    dict : The variants of each effect that are kept, by the effect's name.
+    candidates: all variants of all effects (`SurveyView.signatures`). Returns those that are kept, by the effect's name.
     """
     groups: dict[str, list[Candidate]] = {}
     for candidate in candidates:
@@ -56,8 +39,7 @@ def group_by_effect(candidates: list[Candidate]) -> dict[str, list[Candidate]]:
     for name, variants in groups.items():
         waves = [each for each in variants if each.wave is not None]
         if waves:
-            sides = list(dict.fromkeys(each.fixed.get("camera") for each in waves))
-            first = [each for each in waves if each.fixed.get("camera") == sides[0]]
+            first = [each for each in waves if each.fixed.get("camera") == waves[0].fixed.get("camera")]
             families[name] = [first[len(first) // 2]]
         elif "camera" in variants[0].fixed:
             least = min(len(each.names) for each in variants)
@@ -72,8 +54,6 @@ def parameter_label(candidate: Candidate) -> str:
     """Return the name of an effect's main parameter for tables of detectable sizes, such as "amplitude_m".
 
     Several parameters of one kind are joined by commas. The phase and the period of a wave are left out.
-
-    candidate: the effect.
     """
     hidden = {"phase_rad", "" if candidate.wave is None else candidate.wave.key}
     return ", ".join(name for name in candidate.names if name not in hidden)
@@ -129,12 +109,11 @@ class SurveyDesign:
         Parameters
         ----------
         views : What each scanner station or stereo pair sees of the wall.
-        families : The variants of each effect by its name, as `group_by_effect` gives them. A variant is the effect with one
-            choice of what is not fitted, such as the camera or a period.
+        families : The variants of each effect by its name, as `group_by_effect` gives them.
         points : Additional observations of points with known positions, such as targets; None if the survey has none.
         """
         wanted = [variant for variants in families.values() for variant in variants]
-        columns = np.concatenate([signature_columns(view, wanted) for view in views])
+        columns = np.concatenate([view.signature_columns(wanted) for view in views])
         sigma = np.concatenate([view.sigma for view in views])
         stations = sorted({view.station for view in views})
         pose = np.concatenate(
@@ -148,14 +127,9 @@ class SurveyDesign:
             sigma = np.concatenate([sigma, points.sigma])
         whole, base = columns / sigma[:, None], np.linalg.qr(pose / sigma[:, None])[0]
         left = whole - base @ (base.T @ whole)
-        spans: list[list[slice]] = []
-        start = 0
-        for variants in families.values():
-            spans.append([])
-            for variant in variants:
-                stop = start + variant.columns.shape[1]
-                spans[-1].append(slice(start, stop))
-                start = stop
+        stops = np.cumsum([variant.columns.shape[1] for variant in wanted]).tolist()
+        slices = map(slice, [0, *stops[:-1]], stops)
+        spans = [[next(slices) for _ in variants] for variants in families.values()]
         at = np.concatenate([view.residuals.wall_xy for view in views])
         unit = float(np.median(np.concatenate([view.residuals.unit_m for view in views])))
         scales = [_scales(variants[0]) for variants in families.values()]
@@ -166,10 +140,8 @@ class SurveyDesign:
 
         It is between 0 and 1. Near 0, another pose explains the same change, and the effect stays hidden.
         """
-        sizes = [
-            (float(np.linalg.norm(self.projected[:, v[0]])), float(np.linalg.norm(self.signatures[:, v[0]]))) for v in self.spans
-        ]
-        return np.array([left / max(whole, 1e-300) for left, whole in sizes])
+        left, whole = ([np.linalg.norm(columns[:, v[0]]) for v in self.spans] for columns in (self.projected, self.signatures))
+        return np.array(left) / np.maximum(whole, 1e-300)
 
     def cosines(self) -> FloatArray:
         """Return how similar the m effects look: (m, m) absolute cosines between their changes of the survey's observations.
@@ -180,13 +152,9 @@ class SurveyDesign:
         correlation.
         """
         bases = [[self._basis(span) for span in variants] for variants in self.spans]
-        count = len(bases)
-        found = np.eye(count)
-        for a in range(count):
-            for b in range(count):
-                if a != b:
-                    each = [np.linalg.norm(bases[a][0].T @ other, 2) for other in bases[b]]
-                    found[a, b] = min(max(map(float, each)), 1.0)
+        found = np.eye(len(bases))
+        for a, b in permutations(range(len(bases)), 2):
+            found[a, b] = min(1.0, max(float(np.linalg.norm(bases[a][0].T @ other, 2)) for other in bases[b]))
         return np.maximum(found, found.T)
 
     def _basis(self, span: slice) -> FloatArray:
@@ -198,27 +166,21 @@ class SurveyDesign:
     def detectable_size(self, reference_error_m: float) -> tuple[float, ...]:
         """Return the value of each effect's main parameter from which the survey detects it: a signal-to-noise ratio of 5.
 
-        Parameters
-        ----------
-        reference_error_m : Standard deviation of the reference surface's error, which is correlated over metres, m; 0 for none.
-
-        Returns
-        -------
-        tuple : (m,) values; infinite if another pose of the sensor explains the effect altogether.
+        reference_error_m: standard deviation of the reference surface's error, which is correlated over metres, m; 0 for none.
+        The values (m,) are infinite if another pose of the sensor explains the effect altogether.
         """
-        first = [list(range(variants[0].start, variants[0].stop)) for variants in self.spans]
-        chosen = [column for group in first for column in group]
-        design = np.concatenate([self.pose_basis, self.projected[:, chosen]], axis=1)
+        first = [variants[0] for variants in self.spans]
+        design = np.concatenate([self.pose_basis, *(self.projected[:, span] for span in first)], axis=1)
         information = self._information(design, reference_error_m / self.unit_m)
-        count, places = self.pose_basis.shape[1], {column: number for number, column in enumerate(chosen)}
+        count = stop = self.pose_basis.shape[1]
         nuisance = information[:count, :count]
         found = []
-        for group, scales in zip(first, self.scales, strict=True):
-            rows = [count + places[column] for column in group]
+        for span, scales in zip(first, self.scales, strict=True):
+            rows = range(stop, stop := stop + len(scales))
             cross = information[np.ix_(range(count), rows)]
             own = information[np.ix_(rows, rows)] - cross.T @ np.linalg.solve(nuisance, cross)
             least = float(np.linalg.eigvalsh(own / np.outer(scales, scales))[0])
-            whole = float(np.max(np.sum((self.signatures[:, group] / np.array(scales)) ** 2, axis=0)))
+            whole = float(np.max(np.sum((self.signatures[:, span] / np.array(scales)) ** 2, axis=0)))
             found.append(DETECTION_SNR / np.sqrt(least) if least > _NULL**2 * whole else np.inf)
         return tuple(found)
 
@@ -238,30 +200,3 @@ class SurveyDesign:
         taken = means.T @ sums  # what the means have in the white metric
         left = means.T @ cho_solve(cho_factor(kernel + np.diag(1 / weight)), means)
         return np.asarray(total - taken + left)
-
-
-def signature_columns(view: SurveyView, wanted: list[Candidate]) -> FloatArray:
-    """Return how given effects would change the observations of one scanner station or stereo pair (their signatures).
-
-    Parameters
-    ----------
-    view : What the station or pair sees of the wall.
-    wanted : The effects, each with one choice of what is not fitted, such as the camera or the period of a wave. Pass the same
-        list for all stations of a survey, so that the columns of all have the same meaning.
-
-    Returns
-    -------
-    FloatArray : (n, k) change of the n observations, m or px, per unit of each of the effects' k coefficients.
-    """
-    own = {_key(each): each for each in view_signatures(view)}
-    parts = []
-    for variant in wanted:
-        found = own[_key(variant)]
-        parts.append(found.columns if found.wave is None else found.wave.columns(variant.period))
-    return np.concatenate(parts, axis=1)
-
-
-def _key(candidate: Candidate) -> tuple[Any, ...]:
-    """Key by which the same variant is found in another view."""
-    fixed = {key: value for key, value in candidate.fixed.items() if candidate.wave is None or key != candidate.wave.key}
-    return candidate.name, candidate.names, tuple(sorted(fixed.items(), key=str))

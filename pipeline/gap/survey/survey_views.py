@@ -6,26 +6,27 @@ is kept with it. Further stations, a second face and further pairs are added in 
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Any, ClassVar, Self
+from functools import cached_property
+from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pipeline.config.simulation import SensorName, SimulationConfig
 from pipeline.formats.measurements.measurement import Measurement, StereoMeasurement, SurfaceMeasurement, TlsMeasurement
 from pipeline.formats.point_cloud import PointCloud
+from pipeline.gap.mean.candidates import Candidate
+from pipeline.gap.mean.signatures import systematic_candidates
 from pipeline.gap.residuals.residuals import Residuals
-from pipeline.gap.residuals.stereo_residuals import StereoResiduals, stereo_residuals
-from pipeline.gap.residuals.tls_residuals import TlsResiduals, tls_residuals
+from pipeline.gap.residuals.stereo_residuals import stereo_residuals
+from pipeline.gap.residuals.tls_residuals import tls_residuals
 from pipeline.run.site import prepare_site
 from scene.common.errors import InputError
 from scene.common.keyed_random import KeyedRandom
 from scene.geometry.mesh import FloatArray
-from scene.ray_casting.raycast import RayCaster
 from sensors.cameras.camera import Camera, CameraPair
+from sensors.effects.base import Sensor
 from sensors.laser.tls import LaserScanner, ScannerConfig
 from sensors.models.sensor_model import StereoModel, TlsModel, TlsNoise
 from sensors.stereo.exchanged import pair_of
@@ -56,24 +57,24 @@ class SurveyView:
     residuals : Geometry of n points, a subsample on smooth parts of the wall; the residual values have no meaning.
     point_count : Number of points on smooth parts in the full view.
     station : Number of the station or pair, from 0; views with the same number share a pose.
-    measurement : A measurement that holds the pose of the station or the cameras of the pair.
+    measurement : A measurement that holds the pose of the station or the cameras of the pair. A planned station or pair has
+        simulated points without noise.
     """
 
     residuals: Residuals
     point_count: int
     station: int
-    measurement: Measurement
+    measurement: TlsMeasurement | StereoMeasurement
 
     @classmethod
-    def of(cls, found: Residuals, whole: int, number: int, measurement: Measurement) -> Self:
+    def of(cls, found: Residuals, whole: int, number: int, measurement: TlsMeasurement | StereoMeasurement) -> SurveyView:
         """Make the view of one scanner station or stereo pair. Of a subsample of its points, those on smooth parts are kept.
 
         Parameters
         ----------
         found : Geometry of the subsample, as residuals whose values have no meaning.
         whole : Number of points of the full view, before the subsample was drawn.
-        number : Number of the station or pair; views with the same number share a pose.
-        measurement : A measurement that holds the pose of the station or the cameras of the pair.
+        number, measurement : The fields `station` and `measurement`.
 
         Raises
         ------
@@ -89,6 +90,12 @@ class SurveyView:
             )
         return cls(found.part(smooth), int(whole * len(smooth) / len(found)), number, measurement)
 
+    @classmethod
+    def subsampled(cls, found: Residuals, most: int, number: int, measurement: TlsMeasurement | StereoMeasurement) -> SurveyView:
+        """Make the view of a station or pair from all its points: about `most` points on smooth parts of the wall are kept."""
+        smooth = np.flatnonzero(found.usable)
+        return cls(found.part(smooth[:: max(len(smooth) // most, 1)]), len(smooth), number, measurement)
+
     @property
     def sigma(self) -> FloatArray:
         """(n,) standard deviations of the points of the subsample, m (ranges) or px (disparities), to predict precision.
@@ -97,39 +104,35 @@ class SurveyView:
         """
         return self.residuals.sigma * np.sqrt(len(self.residuals) / max(self.point_count, 1))
 
+    @cached_property
+    def signatures(self) -> list[Candidate]:
+        """How each systematic effect would change the observations, by the name of the effect: its signature.
 
-@dataclass(frozen=True)
-class TlsView(SurveyView):
-    """What one scanner station, real or planned, sees of the wall.
+        An effect with parameters that cannot be fitted, such as a camera or a period, is listed once for each trial value.
+        """
+        return systematic_candidates(self.residuals, self.measurement)
 
-    Attributes
-    ----------
-    residuals : Geometry of the rays of n points, a subsample on smooth parts; the residual values have no meaning, because only
-        the geometry is used.
-    measurement : A measurement with the pose of the station. A planned station has simulated points without noise.
-    """
+    def signature_columns(self, wanted: list[Candidate]) -> FloatArray:
+        """Return the change (n, k) of the n observations, m or px, per unit of each of the k coefficients of given effects.
 
-    residuals: TlsResiduals
-    measurement: TlsMeasurement
+        wanted: the effects, each with one choice of what is not fitted, such as the camera or the period of a wave. Pass the
+        same list for all stations of a survey, so that the columns of all have the same meaning.
+        """
+        own = {_key(each): each for each in self.signatures}
+        found = [(variant, own[_key(variant)]) for variant in wanted]
+        return np.concatenate(
+            [each.columns if each.wave is None else each.wave.columns(variant.period) for variant, each in found], axis=1
+        )
 
 
-@dataclass(frozen=True)
-class StereoView(SurveyView):
-    """What one stereo pair, real or planned, sees of the wall.
-
-    Attributes
-    ----------
-    residuals : Geometry of the pixels of n points, a subsample on smooth parts; the residual values have no meaning, because
-        only the geometry is used.
-    measurement : A measurement with the cameras of the pair.
-    """
-
-    residuals: StereoResiduals
-    measurement: StereoMeasurement
+def _key(candidate: Candidate) -> tuple[Any, ...]:
+    """Key by which the same variant is found in another view."""
+    fixed = {key: value for key, value in candidate.fixed.items() if candidate.wave is None or key != candidate.wave.key}
+    return candidate.name, candidate.names, tuple(sorted(fixed.items(), key=str))
 
 
 @dataclass(frozen=True)
-class Survey(ABC):
+class Survey:
     """A survey of one wall by one sensor, from which surveys with additional views can be made.
 
     Attributes
@@ -138,85 +141,29 @@ class Survey(ABC):
     centre : (3,) centre of the wall, wall frame, m.
     observe : Function that simulates a further view. Its arguments are a measurement with the pose of the station or the cameras
         of the pair, and the number to give to this pose.
-    sensor, place : "tls" or "stereo", and what a place of observation is called in texts.
     """
 
-    views: tuple[TlsView | StereoView, ...]
+    views: tuple[SurveyView, ...]
     centre: FloatArray
-    observe: Callable[[Any, int], TlsView | StereoView]
-    sensor: ClassVar[SensorName]
-    place: ClassVar[str]
+    observe: Callable[[Any, int], SurveyView]
 
-    @abstractmethod
-    def moved(self, scale: float, turn_rad: float, number: int) -> TlsView | StereoView:
+    @property
+    def sensor(self) -> Sensor:
+        """Kind of sensor, "tls" or "stereo"."""
+        return self.views[0].residuals.sensor
+
+    def moved(self, scale: float, turn_rad: float, number: int) -> SurveyView:
         """Simulate what the first station or pair would see from another place, to find out what a further view adds.
 
-        Parameters
-        ----------
-        scale : New distance from the wall's centre, relative to the present one.
-        turn_rad : Rotation of the sensor about the vertical through the wall's centre, rad.
-        number : Number of the new pose, which tells it from those of the other views.
-
-        Raises
-        ------
-        InputError
-            If too little of the wall is seen from there.
+        scale: new distance from the wall's centre, relative to the present one. turn_rad: rotation of the sensor about the
+        vertical through the wall's centre, rad. number: that of the new pose. Raises InputError if too little of the wall is seen
+        from there.
         """
-
-    @abstractmethod
-    def repeated(self, number: int) -> tuple[str, TlsView | StereoView]:
-        """Repeat the first view with the sensor set up in another way, to find out what this adds to the survey.
-
-        Parameters
-        ----------
-        number : Number of the new pose. A laser scanner does not need it, because it keeps its pose.
-
-        Returns
-        -------
-        A description in words, and the view.
-        """
-
-
-@dataclass(frozen=True)
-class TlsSurvey(Survey):
-    """A survey of one wall by laser scans, from which surveys with additional scans can be made."""
-
-    views: tuple[TlsView, ...]
-    observe: Callable[[TlsMeasurement, int], TlsView]
-    sensor = "tls"
-    place = "station"
-
-    def moved(self, scale: float, turn_rad: float, number: int) -> TlsView:
-        """Simulate a scan from another place (see `Survey.moved`)."""
         base = self.views[0].measurement
         turn = _about_vertical(base, turn_rad)
-        position = self.centre + scale * turn @ (base.station[0] - self.centre)
-        return self.observe(base.changed(station=(position, turn @ base.station[1])), number)
-
-    def repeated(self, number: int) -> tuple[str, TlsView]:
-        """Repeat the first station's scan from the same pose in the second face of the instrument (see `Survey.repeated`).
-
-        In the second face, azimuths are larger by pi and zenith angles z become 2 pi - z.
-        """
-        first = self.views[0]
-        g = first.residuals.geometry
-        turned = replace(g, azimuth=g.azimuth + np.pi, zenith=2 * np.pi - g.zenith, by_zenith=-g.by_zenith)
-        return "the scan repeated in the second face", replace(first, residuals=replace(first.residuals, geometry=turned))
-
-
-@dataclass(frozen=True)
-class StereoSurvey(Survey):
-    """A survey of one wall by stereo pairs, from which surveys with additional pairs can be made."""
-
-    views: tuple[StereoView, ...]
-    observe: Callable[[StereoMeasurement, int], StereoView]
-    sensor = "stereo"
-    place = "pair of exposures"
-
-    def moved(self, scale: float, turn_rad: float, number: int) -> StereoView:
-        """Simulate exposures of the first pair from another place (see `Survey.moved`)."""
-        base = self.views[0].measurement
-        turn = _about_vertical(base, turn_rad)
+        if isinstance(base, TlsMeasurement):
+            position = self.centre + scale * turn @ (base.station[0] - self.centre)
+            return self.observe(base.changed(station=(position, turn @ base.station[1])), number)
         world, middle = base.frame.rotation.T @ turn @ base.frame.rotation, base.frame.to_world(self.centre[None])[0]
 
         def place(camera: Camera) -> Camera:
@@ -226,31 +173,26 @@ class StereoSurvey(Survey):
         pair = CameraPair(place(base.cameras.left), place(base.cameras.right))
         return self.observe(base.changed(cameras=pair), number)
 
-    def repeated(self, number: int) -> tuple[str, StereoView]:
-        """Simulate the first stereo pair with its cameras rolled by 45 degrees in opposite directions (see `Survey.repeated`)."""
-        base = self.views[0].measurement
-        pair = base.cameras.rotated("left", 2, np.pi / 4).rotated("right", 2, -np.pi / 4)
-        return "the pair repeated with its cameras rolled by 45 degrees in opposite directions", self.observe(
-            base.changed(cameras=pair), number
-        )
+    def repeated(self, number: int) -> tuple[str, SurveyView]:
+        """Repeat the first view with the sensor set up in another way. Returns a description in words, and the view.
+
+        A laser scanner scans from the same pose in its second face, in which azimuths are larger by pi and zenith angles z become
+        2 pi - z. The cameras of a pair are rolled by 45 degrees in opposite directions; their new pose gets the given number.
+        """
+        first = self.views[0]
+        if isinstance(first.measurement, StereoMeasurement):
+            pair = first.measurement.cameras.rotated("left", 2, np.pi / 4).rotated("right", 2, -np.pi / 4)
+            view = self.observe(first.measurement.changed(cameras=pair), number)
+            return "the pair repeated with its cameras rolled by 45 degrees in opposite directions", view
+        g: Any = first.residuals.geometry
+        turned = replace(g, azimuth=g.azimuth + np.pi, zenith=2 * np.pi - g.zenith, by_zenith=-g.by_zenith)
+        return "the scan repeated in the second face", replace(first, residuals=replace(first.residuals, geometry=turned))
 
 
 def planned_survey(config: SimulationConfig, sensor: SensorName) -> Survey:
     """Simulate what the scanner stations or cameras of a config would see of the wall, to judge a survey before fieldwork.
 
-    Parameters
-    ----------
-    config : The simulation config, with the wall and the positions of the sensor.
-    sensor : "tls" or "stereo".
-
-    Returns
-    -------
-    Survey : the views of all stations or pairs, the wall's centre, and a function that simulates further views.
-
-    Raises
-    ------
-    InputError
-        If the sensor sees too little of the wall.
+    Raises InputError if the sensor sees too little of the wall.
     """
     site = prepare_site(config, sensor, KeyedRandom(config.seed))
     nothing, mesh, frame, centre = PointCloud(np.empty((0, 3))), site.mesh, site.frame, site.mesh.bounds.mean(axis=0)
@@ -258,38 +200,24 @@ def planned_survey(config: SimulationConfig, sensor: SensorName) -> Survey:
         model, cameras = config.stereo_model(), pair_of(site.sensor).cameras
         pair = StereoMeasurement(cloud=nothing, reference=mesh, frame=frame, model=model, cameras=cameras)
         expose = _pair_observer(config.depth_map)
-        return StereoSurvey((expose(pair, 0),), centre, expose)
+        return Survey((expose(pair, 0),), centre, expose)
     poses = [(scanner.position, scanner.rotation) for scanner in (site.sensor, *site.further_stations)]
     base = TlsMeasurement(cloud=nothing, reference=mesh, frame=frame, model=config.tls_model(), station=poses[0])
     observe = _scan_observer(config.scanner)
     views = tuple(observe(base.changed(station=pose), number) for number, pose in enumerate(poses))
-    return TlsSurvey(views, centre, observe)
+    return Survey(views, centre, observe)
 
 
 def measured_survey(measurement: Measurement, most: int = _MOST_PULSES) -> Survey:
     """Describe from where a measurement saw the wall, to find out which sensor effects it could detect and tell apart.
 
     Each scanner station, or the stereo pair, becomes one view. Only the positions of its points count, not their residuals.
-
-    Parameters
-    ----------
-    measurement : The measurement.
-    most : Largest number of points in the subsample of each view.
-
-    Returns
-    -------
-    Survey : the views of all stations or pairs, the wall's centre, and a function that simulates further views.
-
-    Raises
-    ------
-    InputError
-        If the measurement has no cameras or station.
+    most: largest number of points in the subsample of each view. Raises InputError if the measurement has no cameras or station.
     """
     centre = measurement.reference.bounds.mean(axis=0)
     if isinstance(measurement, StereoMeasurement):
-        seen = stereo_residuals(measurement)
-        pair = StereoView(seen.part(_subsample_rows(seen, most)), int(seen.usable.sum()), 0, measurement)
-        return StereoSurvey((pair,), centre, _pair_observer("medium"))
+        pair = SurveyView.subsampled(stereo_residuals(measurement), most, 0, measurement)
+        return Survey((pair,), centre, _pair_observer("medium"))
     if isinstance(measurement, SurfaceMeasurement):
         raise InputError(
             "the measurement has no cameras, so no effect can be analysed",
@@ -298,33 +226,20 @@ def measured_survey(measurement: Measurement, most: int = _MOST_PULSES) -> Surve
         )
     measurement = measurement.changed(order=None)
     set_ups = [(scan.set_up, one) for scan, rows, one in measurement.each_scan() if len(rows)]
-    found, *others = [(number, one, tls_residuals(one)) for number, one in set_ups or [(0, measurement)]]
-    views = tuple(
-        TlsView(each.part(_subsample_rows(each, most)), int(each.usable.sum()), number, one)
-        for number, one, each in (found, *others)
-    )
-    _, measurement, residuals = found
-    view = views[0]
-    step = float(np.sqrt(np.prod(np.ptp(measurement.cloud.points[:, :2], axis=0)) / max(view.point_count, 1)))
-    reach = float(np.median(residuals.geometry.range_m))
-    steps = {"azimuth_step_rad": step / reach, "zenith_step_rad": step / reach}  # coarser than the scan on near parts
-    scanner = ScannerConfig(zenith_limits_rad=(0.05, 3.09)).model_copy(update=steps)
-    return TlsSurvey(views, centre, _scan_observer(scanner))
+    found = [(number, one, tls_residuals(one)) for number, one in set_ups or [(0, measurement)]]
+    views = tuple(SurveyView.subsampled(each, most, number, one) for number, one, each in found)
+    _, first, residuals = found[0]
+    step = float(np.sqrt(np.prod(np.ptp(first.cloud.points[:, :2], axis=0)) / max(views[0].point_count, 1)))
+    step_rad = step / float(np.median(residuals.geometry.range_m))  # coarser than the scan on near parts
+    update = {"azimuth_step_rad": step_rad, "zenith_step_rad": step_rad}
+    scanner = ScannerConfig(zenith_limits_rad=(0.05, 3.09)).model_copy(update=update)
+    return Survey(views, centre, _scan_observer(scanner))
 
 
-def _subsample_rows(found: Residuals, most: int) -> NDArray[np.int64]:
-    """Rows of a subsample on smooth parts of the wall."""
-    rows = np.flatnonzero(found.usable)
-    return rows[:: max(len(rows) // most, 1)]
+def _scan_observer(scanner: ScannerConfig) -> Callable[[TlsMeasurement, int], SurveyView]:
+    """Return a function that scans the wall from a measurement's pose: the whole wall, unless the config has a window."""
 
-
-def _scan_observer(scanner: ScannerConfig) -> Callable[[TlsMeasurement, int], TlsView]:
-    """Return a function that scans the wall from a measurement's pose.
-
-    The scan covers the whole wall, unless the config has a window.
-    """
-
-    def observe(base: TlsMeasurement, number: int) -> TlsView:
+    def observe(base: TlsMeasurement, number: int) -> SurveyView:
         world = base.frame.to_world(base.station[0][None])[0], base.frame.rotation.T @ base.station[1]
         instrument = LaserScanner.aimed(world, base.frame, base.reference.vertices, scanner, _QUIET_TLS)
         pattern = instrument.pattern
@@ -338,33 +253,24 @@ def _scan_observer(scanner: ScannerConfig) -> Callable[[TlsMeasurement, int], Tl
         )
         seen = replace(instrument, pattern=subsampled).observe(base.scene, KeyedRandom(0, ("gap", "planned")))
         valid = seen.valid.ravel()
-        power = (
-            None
-            if seen.intensity is None
-            else _with_albedo(np.asarray(seen.intensity.ravel()[valid], dtype=np.float64), base.scene)
-        )
+        power = None if seen.intensity is None else seen.intensity.ravel()[valid].astype(np.float64)
+        if power is not None and base.scene.mesh.vertex_albedo is None:
+            random = KeyedRandom(0, ("gap", "albedo")).generator()
+            power *= np.exp(_ALBEDO_SPREAD * random.standard_normal(len(power)))
         cloud = PointCloud(seen.points.reshape(-1, 3)[valid], power, np.flatnonzero(valid).astype(float))
         measurement = base.changed(cloud=cloud)
         found = tls_residuals(measurement)
         lines = found.geometry.line
         geometry = found.geometry if lines is None else replace(found.geometry, line=stride * lines)
-        return TlsView.of(replace(found, geometry=geometry), int(valid.sum()) * stride**2, number, measurement)
+        return SurveyView.of(replace(found, geometry=geometry), int(valid.sum()) * stride**2, number, measurement)
 
     return observe
 
 
-def _with_albedo(power: FloatArray, scene: RayCaster) -> FloatArray:
-    """Powers with a random albedo, if the wall has none of its own."""
-    if scene.mesh.vertex_albedo is not None:
-        return power
-    random = KeyedRandom(0, ("gap", "albedo")).generator()
-    return np.asarray(power * np.exp(_ALBEDO_SPREAD * random.standard_normal(len(power))), dtype=np.float64)
-
-
-def _pair_observer(quality: Quality) -> Callable[[StereoMeasurement, int], StereoView]:
+def _pair_observer(quality: Quality) -> Callable[[StereoMeasurement, int], SurveyView]:
     """Return a function that observes the wall with a measurement's cameras, at the coarsest depth map."""
 
-    def observe(base: StereoMeasurement, number: int) -> StereoView:
+    def observe(base: StereoMeasurement, number: int) -> SurveyView:
         pair = StereoPair(base.cameras, base.frame, _QUIET_STEREO, "low")
         points = pair.observe(base.scene, KeyedRandom(0, ("gap", "planned"))).points
         step = REDUCTION["low"]
@@ -376,7 +282,7 @@ def _pair_observer(quality: Quality) -> Callable[[StereoMeasurement, int], Stere
         cloud = PointCloud(some[valid], extra={name: values[valid] for name, values in pixels.items()})
         measurement = base.changed(cloud=cloud, surroundings=None)
         whole = int(valid.sum() * stride**2 * (step / REDUCTION[quality]) ** 2)
-        return StereoView.of(stereo_residuals(measurement), whole, number, measurement)
+        return SurveyView.of(stereo_residuals(measurement), whole, number, measurement)
 
     return observe
 
