@@ -131,7 +131,8 @@ class Evidence:
         The required share is the threshold `verdict.least_closed`, by default one half. Also true if the gap is too small to be
         measured.
         """
-        gap, by = self.gap, thresholds().verdict
+        gap = self.gap
+        by = thresholds().verdict
         if gap is None or gap.closed is None:
             return True
         return gap.before - gap.after + by.gap_sigmas * gap.error < by.least_closed * (gap.before - gap.floor)
