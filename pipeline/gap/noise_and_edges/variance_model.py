@@ -167,7 +167,8 @@ def fit_variance_model(
     seen = _SquaredDeviations.of(residuals, cells, value, candidates, random) if candidates else None
     if seen is None:
         return [], [], ""
-    by, edges = thresholds().variance, thresholds().edges
+    by = thresholds().variance
+    edges = thresholds().edges
     best, tried = seen.best, seen.scores()
     added = best.added(seen.shapes)
     p_value = null_p_value(seen.squares, [shape.sum(axis=1) for shape in seen.shapes], seen.block, random)
