@@ -2,7 +2,7 @@
 
 A gain is a log-likelihood ratio of the models with and without an effect; a score is a gain minus a penalty for the parameters.
 Wall blocks are squares of the wall, which count as independent. Their agreement is measured like a number of standard deviations:
-the sum of their gains over the root of the sum of squared gains.
+the sum of their gains over the root of the sum of squared gains. The last text of each field states where its value comes from.
 """
 
 from __future__ import annotations
@@ -15,8 +15,8 @@ from pipeline.gap.threshold_field import DEVELOPMENT, JUDGEMENT, ThresholdGroup,
 class VarianceThresholds(ThresholdGroup):
     """Thresholds by which `gap` accepts noise terms: effects that change the variance of the residuals (variance model).
 
-    An empirical term is a variance that is fitted freely in bins of a covariate, such as the range. Losses free by direction
-    are fitted likewise, in bins of an angle.
+    An empirical term is a variance that is fitted freely in bins of a covariate, such as the range. Losses of laser pulses that
+    are free by direction have a probability that is fitted likewise in bins of the azimuth or zenith angle.
     """
 
     least_gain: PositiveFloat = threshold_field(
@@ -134,8 +134,8 @@ class EdgeThresholds(ThresholdGroup):
     block_sigmas: PositiveFloat = threshold_field(
         3.0,
         "root sums of squares of the wall blocks' gains",
-        "The wall blocks must agree by this much on an edge effect, on a second noise term, on a variance free in bins that is "
-        "as sure as a second term, on grid-correlated noise where single points show no added variance, or on noise that is "
+        "The wall blocks must agree by this much on an edge effect, on a second noise term, on a variance free in bins for which "
+        "a noise term loses its name, on grid-correlated noise where single points show no added variance, or on noise that is "
         "lower than predicted.",
         JUDGEMENT,
     )

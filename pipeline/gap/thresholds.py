@@ -282,7 +282,8 @@ def equivalence_margin(log_likelihood_ratio: float) -> float:
     """Return the difference of scores within which two effects count as indistinguishable, so that both are reported.
 
     It is the threshold `mean.class_margin`, or the share `mean.class_share` of the log-likelihood ratio of the models with and
-    without the chosen effect if that is larger.
+    without the chosen effect if that is larger: an effect's pattern of residuals is linearised, and is inexact by about this
+    share. log_likelihood_ratio: that of the chosen effect.
     """
     by = thresholds().mean
     return max(by.class_margin, by.class_share * log_likelihood_ratio)

@@ -6,13 +6,14 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.special import j0
 from test_gap_shared_noise import NOISE, SIGMA, noisy, raster
 
 from pipeline.change.robust import nmad
 from pipeline.gap.mean.candidates import Candidate, SineGrid
 from pipeline.gap.mean.design import Design
-from pipeline.gap.mean.mean_model import MeanFit, MeanModel, _NormalEquations
-from pipeline.gap.mean.nonparametric_terms import nonparametric_terms
+from pipeline.gap.mean.mean_model import MeanFit, MeanModel, _NormalEquations, _wavy
+from pipeline.gap.mean.nonparametric_terms import harmonics, nonparametric_terms
 from pipeline.gap.mean.projected_columns import WithinProducts
 from pipeline.gap.mean.search import MeanSearch
 from pipeline.gap.residuals import wall_blocks
@@ -137,3 +138,18 @@ def test_covariances_that_are_kept_are_those_that_were_likely(design: Design) ->
     normal = _NormalEquations(*(each.in_bases(kept) for each in of_all), products)
     assert max(normal.log_likelihood(each) for each in covariances) == pytest.approx(highest, abs=1e-6)
     assert max(normal.log_likelihood(each) for each in model.covariances) == pytest.approx(highest, abs=1e-6)
+
+
+@pytest.mark.parametrize("count", [100, 100_000])
+def test_the_correlation_of_waves_is_exact_whether_interpolated_or_not(count: int) -> None:
+    distance = np.random.default_rng(1).uniform(0, 40, count)
+    exact = np.mean([j0(2 * np.pi * distance / wave) for wave in 1.7 * np.geomspace(0.7, 1.9, 6)], axis=0)
+    np.testing.assert_allclose(_wavy((0.7, 1.9, 6), 1.7, distance), exact, atol=1e-7)
+
+
+def test_a_term_that_was_added_to_the_model_can_be_fitted_again(design: Design, families: list[Candidate | SineGrid]) -> None:
+    """Overtones of a sine are no family, but become columns of the design when others are scored beside them."""
+    sine = next(each for each in families if isinstance(each, SineGrid)).candidates[3]
+    overtones = harmonics("image_x", sine, 3)
+    beside = design.conditioned_on(overtones)
+    assert beside.fit([overtones]).log_likelihood == pytest.approx(design.fit([overtones]).log_likelihood, abs=1e-6)

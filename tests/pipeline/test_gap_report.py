@@ -130,6 +130,7 @@ def test_each_of_several_effects_says_what_it_takes_away(few: tuple[GapDiagnosis
     first, second = contributions(replace(found, effects=(NAMED, NAMED)), measurement)
     np.testing.assert_array_equal(first, second)
     assert 0 < np.abs(first).max() < 0.0045
+    assert contributions(replace(found, effects=()), measurement).shape == (0, len(found.before))
 
 
 @pytest.mark.parametrize(("verdict", "told"), [("unknown", True), ("no_gap", True), ("named", False)])

@@ -8,7 +8,6 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from itertools import zip_longest
 from typing import Any
 
 import numpy as np
@@ -370,13 +369,13 @@ class Design:
     def _split(self, candidate: Candidate, matrix: FloatArray) -> ProjectedColumns:
         """Split columns of a candidate, with the pose projected out. matrix: (n, k) its columns over sigma."""
         if candidate.wave is None and candidate in self.column_numbers:
-            return self.fixed.select(self.column_numbers[candidate])
+            return self._select(self.column_numbers[candidate])
         return self.model.project(_projected(self.pose_basis, matrix))
 
     def _matrices(self, candidates: list[Candidate], wave_coefficients: Sequence[FloatArray | None] = ()) -> list[FloatArray]:
         """Columns of each candidate over sigma, with a sine's derivative by its frequency if its coefficients are given."""
-        rows, root = self.model.rows, self.model.inverse_sigma[:, None]
-        return [each.columns_given(known)[rows] * root for each, known in zip_longest(candidates, wave_coefficients)]
+        rows, root, given = self.model.rows, self.model.inverse_sigma[:, None], wave_coefficients or [None] * len(candidates)
+        return [each.columns_given(known)[rows] * root for each, known in zip(candidates, given, strict=True)]
 
 
 def _columns(model: MeanModel, pose: FloatArray, plain: list[Candidate], place: Mapping[Candidate, list[int]]) -> FloatArray:

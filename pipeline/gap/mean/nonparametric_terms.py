@@ -47,7 +47,7 @@ def nonparametric_terms(
     They describe errors for which the catalogue of sensor errors has no effect. All change the observable (range, disparity or
     distance) itself, and all are functions of the standardised covariate (mean 0, standard deviation 1).
 
-    All waves are one grid of trial frequencies.
+    All waves are one `SineGrid`: a wave with a grid of trial frequencies.
 
     Parameters
     ----------
@@ -120,8 +120,8 @@ def _frequencies(x: FloatArray, most_cycles: float, highest: float = np.inf) -> 
 
 
 def _waves(covariate: str, factor: FloatArray, x: FloatArray, tried: FloatArray) -> list[SineGrid]:
-    """Make a wave in x with the frequencies `tried`, as a list of one grid; empty if there are fewer than two."""
-    if len(tried) < 2:
+    """Make a wave in x with the frequencies `tried`, as a list of one grid; empty if they are fewer than two, or 0."""
+    if len(tried) < 2 or tried[0] <= 0:
         return []
     wave = Wave("period", factor, x, float(np.mean(x)), float(tried[0]))
     return [SineGrid(covariate, "amplitude", wave, tried, empirical=True)]
@@ -174,7 +174,7 @@ def half_pixel_sine(covariate: str, disparity: FloatArray) -> list[SineGrid]:
     The sine with one cycle per pixel, pixel locking, is an effect of the catalogue and is not made here. The trial frequencies
     are up to 3 % from the nominal one.
 
-    covariate: name of the covariate, the disparity. disparity: (n,) values, px; they must not all be equal.
+    covariate: name of the covariate, the disparity. disparity: (n,) values, px; if all are equal, the list is empty.
     """
     x = _standardised(disparity)
     tried = float(disparity.std()) * disparity_frequencies(2.0, robust_extent(disparity))

@@ -158,10 +158,13 @@ class CandidateScorer(Protocol):
         """
 
     def p_value(self, score: float) -> float:
-        """Return the probability that the best of all candidate errors has such a penalised log-likelihood ratio by chance."""
+        """Return the probability that by chance the best of all candidates reaches a score: a penalised log-likelihood ratio."""
 
     def joint_score(self, members: EffectSet) -> float:
-        """Return the score of several errors together: their joint log-likelihood ratio minus the penalty of each."""
+        """Return the score of several errors together: their joint log-likelihood ratio minus the penalty of each.
+
+        The periods of sines among the members are refined first.
+        """
 
     def with_harmonics(self, members: EffectSet, form: FamilyScore) -> FamilyScore:
         """Replace a non-parametric term that describes a periodic error by its best periodic form, such as a wave with overtones.

@@ -64,9 +64,9 @@ def candidate_families(
 ) -> list[Candidate | SineGrid]:
     """List all regression terms that a forward selection tries as explanations of the systematic part of residuals.
 
-    They are of three kinds: sensor errors of the catalogue; terms along each covariate that name no
-    cause (line, spline, steps, waves), for errors that the catalogue lacks; and such terms along oblique directions on the wall.
-    No sensor causes the last ones, so they show what an error of the reference surface can imitate.
+    They are of three kinds: sensor errors of the catalogue; terms along each covariate that name no cause (line, spline, steps,
+    waves), for errors that the catalogue lacks; and such terms along oblique directions on the wall. No sensor causes the last
+    ones, so they show what an error of the reference surface can imitate.
 
     Parameters
     ----------

@@ -78,8 +78,9 @@ def screen_effects(measurement: Measurement, part: Residuals, candidates: Sequen
     rows = np.arange(0, len(part), max(len(part) // _FEWEST_POINTS, 1))
     few = part.part(rows)
     points, few = measurement.part(few.index), replace(few, index=np.arange(len(rows)))
-    first_steps = (estimate_of_size(each, gauss_newton_step(few, [each])) for each in (each.part(rows) for each in candidates))
-    screened = zip(candidates, (_ScreenedEffect.of(points, few, estimate) for estimate in first_steps), strict=True)
+    at_few = (each.part(rows) for each in candidates)
+    fits = (_ScreenedEffect.of(points, few, estimate_of_size(each, gauss_newton_step(few, [each]))) for each in at_few)
+    screened = zip(candidates, fits, strict=True)
     possible = [(each, fit) for each, fit in screened if fit is not None and np.isfinite(fit.noise_left)]
     found = []
     for candidate, fit in sorted(possible, key=lambda item: item[1].noise_left)[:count]:

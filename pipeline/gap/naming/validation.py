@@ -20,7 +20,7 @@ from sensors.effects.base import ShowsIn
 from sensors.models.sensor_model import StereoModel, TlsModel
 
 _FEWEST_POINTS, _MOST_POINTS = 100, 30_000
-"""Fewest points that are scored; and the number from twice which on points are left out at even distances, to save time."""
+"""Fewest points that are scored. From twice the second number on, only every second, third ... point is used, to save time."""
 
 
 @dataclass(frozen=True)

@@ -138,7 +138,7 @@ class Evidence:
         return gap.before - gap.after + by.gap_sigmas * gap.error < by.least_closed * (gap.before - gap.floor)
 
     def only_noise_too_large(self, named: Sequence[NamedEffect]) -> bool:
-        """Tell whether the only fault of the sensor model is that its noise is too large: also, no sensor errors are `named`."""
+        """Tell whether the sensor model's only fault is too large noise. named: sensor errors; with any, the answer is false."""
         still_open = self.gap is not None and self.gap.left_open and not self.model_is_accepted
         return self.noise_ratio < 1.0 and not (
             named or self.misfit_is_significant or self.outlier_share or self.is_overdispersed or still_open

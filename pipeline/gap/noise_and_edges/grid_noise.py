@@ -202,7 +202,9 @@ def find_grid_noise(
 
     Parameters
     ----------
-    part, value, model : arguments of `separate_white_and_grid_noise`.
+    part : disparity residuals of n points.
+    value : (n,) residuals after the systematic effects, px.
+    model : sensor model of the pair.
     random : source of random numbers for the null distribution.
 
     Returns

@@ -30,7 +30,9 @@ def detectable_noise(
 
     Parameters
     ----------
-    residuals, cells, value : arguments of `fit_variance_model`, which would have found them.
+    residuals : Residuals of n points with their predicted standard deviations.
+    cells : Small squares of the wall; deviations from a plane within each are used.
+    value : (n,) residuals after the systematic effects are removed, m (ranges) or px (disparities).
     named : Names of effects that were found, which are not listed.
     random : Source of random numbers, for the null distribution of the test statistic.
 

@@ -193,7 +193,8 @@ def find_tile_seams(residuals: StereoResiduals, registered_residuals: FloatArray
     finer = sides[first] * np.linspace(1 - reach, 1 + reach, _REFINED)
     trials = test.trials(finer)
     sigmas, best = _most_significant(trials)
-    near, (total, information) = finer[np.abs(sigmas) > abs(sigmas[best]) - 1], map(float, trials[:, best])
+    near = finer[np.abs(sigmas) > abs(sigmas[best]) - 1]
+    total, information = map(float, trials[:, best])
     amplitude, unequal = total / information, find_unequal_tiles(residuals, registered_residuals)
     if unequal is not None and (2 * amplitude) ** 2 < _LEAST_PATTERN_SHARE * unequal.jump_px**2:
         return None
@@ -283,12 +284,13 @@ def detectable_tile_shift(residuals: StereoResiduals, registered_residuals: Floa
         )
     side = test.sides[len(test.sides) // 2]
     needed = float(norm.isf(thresholds().locking.significance / (2 * len(test.sides)))) + float(norm.ppf(POWER))
-    size = needed / float(np.sqrt(test.trials(np.array([side]))[1, 0]))
+    _, (information,) = test.trials(np.array([side]))
+    size = needed / float(np.sqrt(information))
     return DetectableSize(name, "amplitude_px", size, {"tile_px": float(side)})
 
 
 def _most_significant(trials: FloatArray) -> tuple[FloatArray, int]:
-    """(k,) amplitudes of trials (2, k) over their standard deviations, and the number of the largest."""
+    """(k,) amplitudes of trials (2, k) over their standard deviations, and the index of the largest in magnitude."""
     total, information = trials
     sigmas = np.divide(total, np.sqrt(information), out=np.zeros_like(total), where=information > 0)
     return sigmas, int(np.argmax(np.abs(sigmas)))

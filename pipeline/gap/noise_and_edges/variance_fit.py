@@ -27,7 +27,8 @@ class VarianceCandidate:
     ----------
     name : name of the effect.
     variance : (n, k) variance that each parameter adds at its typical size, squared unit of the observable (m² or px²).
-    sizes : k typical sizes by the name of the parameter, the main one first; its value is its size times sqrt(theta).
+    sizes : typical size of each of the k parameters, by name, the main one first. A parameter's value is its typical size times
+        sqrt(theta).
     fixed : values, by name, of parameters that are not fitted; each of a few trial values makes a candidate of its own.
     """
 
@@ -42,19 +43,19 @@ class VarianceCandidate:
         return float(len(self.sizes) + len(self.fixed))
 
     def parameters(self, theta: FloatArray) -> dict[str, float]:
-        """Convert fitted factors theta (k,) of the variance to values of the noise effect's parameters, by name."""
+        """Convert fitted factors theta (k,) to values of the noise effect's parameters, by name; 1 gives the typical size."""
         return self._by_name(np.sqrt(theta)) | dict(self.fixed)
 
     def main_parameter(self, theta: float) -> tuple[str, float]:
-        """Return name and value of the noise effect's main parameter if theta is the same for all."""
+        """Return name and value of the first parameter if one factor theta applies to the variances of all parameters."""
         name, size = next(iter(self.sizes.items()))
         return name, float(np.sqrt(theta)) * size
 
     def standard_deviations(self, theta: FloatArray, error: FloatArray) -> dict[str, float]:
         """Return the standard deviations of a noise effect's parameters by name, from those (k,) of the factors theta (k,).
 
-        If a factor is below its standard deviation, the parameter may be 0. Its value is then returned at which the factor equals
-        its standard deviation.
+        If a factor is below its standard deviation, the parameter may be 0. The size at which the factor equals its standard
+        deviation is then returned instead.
         """
         return self._by_name(np.where(theta > error, error / np.maximum(2 * np.sqrt(theta), 1e-300), np.sqrt(error)))
 

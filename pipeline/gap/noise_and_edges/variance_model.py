@@ -161,7 +161,9 @@ def fit_variance_model(
 
     Returns
     -------
-    tuple : the noise terms; the scores of all candidates, best first; and a note on variance that no effect explains, or "".
+    tuple : the noise terms; the scores of all candidates, best first; and a note on variance that no effect explains, or "". A
+        term is marked empirical if a variance free in bins of a covariate fits better by more than the share
+        `variance.nonparametric_share`, or if it fits clearly better and the wall blocks agree by `edges.block_sigmas`.
     """
     candidates = [each for each in variance_candidates(residuals) if each.name not in excluded]
     seen = _SquaredDeviations.of(residuals, cells, value, candidates, random) if candidates else None
@@ -188,8 +190,8 @@ def fit_variance_model(
     lead = free.score - chosen.score
     if not seen.is_clearly_better(lead, added, free.added, edges.least_block_sigmas):
         return seen.terms(chosen, p_value), tried, ""
-    as_sure_as_a_second_term = seen.is_clearly_better(lead, added, free.added, edges.block_sigmas)
-    empirical = as_sure_as_a_second_term or lead > by.nonparametric_share * chosen.gain
+    blocks_agree_clearly = seen.is_clearly_better(lead, added, free.added, edges.block_sigmas)
+    empirical = blocks_agree_clearly or lead > by.nonparametric_share * chosen.gain
     named = [replace(each, empirical=empirical) for each in seen.terms(best if empirical else chosen, p_value)]
     varies = "varies" if empirical else "also varies"
     return named, tried, f"the noise {varies} with {free.name}, which no effect of the catalogue explains"
@@ -264,9 +266,11 @@ class _SquaredDeviations:
         return sorted(best.values(), key=lambda item: -item.score)
 
     def is_clearly_better(self, lead: float, first: FloatArray, second: FloatArray, least_sigmas: float) -> bool:
-        """Whether a second added variance (n,) fits clearly better than a first, and the wall blocks agree by `least_sigmas`.
+        """Tell whether a second variance fits clearly better than a first, and the wall blocks agree by at least `least_sigmas`.
 
-        lead: difference of their scores, which must exceed the inexact part of the best effect, whose form is never exact.
+        lead: score of the second minus that of the first. It must exceed `variance.least_gain`, and the share `mean.class_share`
+        of the best effect's gain, because the form of an effect is never exact. first, second: (m,) variances that they add at
+        the points used, over the predicted one.
         """
         terms = 0.5 * (self.squares * (second - first) / ((1 + first) * (1 + second)) + np.log1p(first) - np.log1p(second))
         sums = np.bincount(np.unique(self.block, return_inverse=True)[1], terms)
@@ -347,7 +351,9 @@ class NoiseRatio:
 
         Parameters
         ----------
-        residuals, cells, value : arguments of `standardised_deviations`.
+        residuals : residuals of n points with their predicted standard deviations.
+        cells : small squares of the wall; deviations from a plane within each are used.
+        value : (n,) residuals after the systematic effects are removed, m (ranges) or px (disparities).
         random : source of random numbers, with which correlated noise is simulated.
         """
         z = standardised_deviations(residuals, cells, value)

@@ -20,7 +20,7 @@ def contributions(found: GapDiagnosis, measurement: Measurement) -> FloatArray:
 
     Parameters
     ----------
-    found : diagnosis with k named effects (at least one) and n points.
+    found : diagnosis with k named effects and n points.
     measurement : measurement that was diagnosed.
 
     Returns
@@ -35,4 +35,4 @@ def contributions(found: GapDiagnosis, measurement: Measurement) -> FloatArray:
         rest = fit_pose(residuals, residuals.usable & np.isin(residuals.index, registration_rows))
         value = residuals.values_at(residuals.value - residuals.pose_jacobian @ rest, np.arange(len(found.before)))
         parts.append(np.where(np.isfinite(value), found.before - value, 0.0))
-    return np.stack(parts)
+    return np.reshape(parts, (len(parts), len(found.before)))

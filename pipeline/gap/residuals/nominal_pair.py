@@ -295,9 +295,10 @@ def predict_disparities(nominal: NominalPair, real: Iterable[CameraPair], geomet
 
 
 def moved_pairs(pair: CameraPair, step: float) -> list[CameraPair]:
-    """Move both cameras of a pair together, as one rigid body, in six ways, to compute derivatives by the pose.
+    """Return six copies of a camera pair, each moved a little as one rigid body, to compute derivatives by the pose.
 
-    They are shifted by `step`, m, along x, y and z, and then rotated by `step`, rad, about these axes through the left camera.
+    The first three are shifted by `step`, m, along x, y or z. The last three are rotated by `step`, rad, about the axis x, y or
+    z through the left camera. The axes are those of the frame of the pair's poses, such as the wall frame.
     """
     units, centre = step * np.eye(3), pair.left.position
 

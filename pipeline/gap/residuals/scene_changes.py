@@ -245,7 +245,7 @@ def _significant(z: FloatArray, level: float, ratio: float, pairs: Pairs, eligib
 def _log_expected(count: NDArray[np.int64], points: int, stray: int, agreeing: float) -> FloatArray:
     """Return log E(m), the logarithm of the number of components of m points expected by chance, for sizes m (k,).
 
-    points: number N of points searched. stray: how many of them exceed the level by chance. agreeing: share c of pairs of values
+    points: number of points searched. stray: how many of them exceed the level by chance. agreeing: share of pairs of values
     that agree.
     """
     shapes = _SHAPES[np.minimum(count, len(_SHAPES)) - 1] + _GROWTH * np.maximum(count - len(_SHAPES), 0)

@@ -114,6 +114,7 @@ def wall_blocks_by_points(at: FloatArray, points: float) -> NDArray[np.int64]:
 def agreement(sums: NDArray[Any]) -> float:
     """Return how far wall blocks agree that one model fits better than another, like a number of standard deviations.
 
-    It is the sum of their log-likelihood ratios (b,) over the root of the sum of squares, to which a few blocks add little.
+    It is the sum of the blocks' log-likelihood ratios over the root of the sum of their squares: sqrt(b) if b blocks gain
+    alike, and 1 if a single block gains everything. sums: (b,) log-likelihood ratio of each block, or its sign.
     """
     return float(sums.sum()) / max(float(np.linalg.norm(sums)), 1e-300)

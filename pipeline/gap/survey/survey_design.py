@@ -128,7 +128,7 @@ class SurveyDesign:
         whole, base = columns / sigma[:, None], np.linalg.qr(pose / sigma[:, None])[0]
         left = whole - base @ (base.T @ whole)
         stops = np.cumsum([variant.columns.shape[1] for variant in wanted]).tolist()
-        slices = map(slice, [0, *stops[:-1]], stops)
+        slices = map(slice, [0, *stops[:-1]], stops)  # columns of each variant, in the order of `wanted`
         spans = [[next(slices) for _ in variants] for variants in families.values()]
         at = np.concatenate([view.residuals.wall_xy for view in views])
         unit = float(np.median(np.concatenate([view.residuals.unit_m for view in views])))

@@ -106,7 +106,7 @@ class SurveyView:
 
     @cached_property
     def signatures(self) -> list[Candidate]:
-        """How each systematic effect would change the observations, by the name of the effect: its signature.
+        """Signatures of all systematic effects: how each would change the observations, as regression terms.
 
         An effect with parameters that cannot be fitted, such as a camera or a period, is listed once for each trial value.
         """
