@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import re
 from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
@@ -26,6 +27,7 @@ from pipeline.gap.report.contributions import contributions
 from pipeline.gap.report.covariate_ranking import rank_disagreements
 from pipeline.gap.report.figures import gap_figure, maps_figure
 from pipeline.gap.report.quantities import format_with_std
+from pipeline.gap.report.wording import paragraph
 from pipeline.gap.residuals.nominal_pair import PixelGeometry
 from pipeline.gap.residuals.residuals import ExpectedPulses
 from pipeline.gap.residuals.stereo_residuals import StereoResiduals
@@ -122,6 +124,12 @@ def test_what_is_closed_is_said_by_the_thresholds_of_the_diagnosis(few: tuple[Ga
     strict = read_thresholds(["verdict.gap_sigmas=1000", "verdict.rejection_p=1e-300"])
     assert report.to_dict(replace(found, gap=gap), measurement)["gap"]["closed"] == 1.0
     assert report.to_dict(replace(found, gap=gap, thresholds=strict), measurement)["gap"]["closed"] is None
+
+
+@pytest.mark.parametrize(("count", "starts"), [(1, ["It is"]), (3, ["One effect is", "Another one is", "Another one is"])])
+def test_the_paragraph_counts_the_named_effects(few: tuple[GapDiagnosis, Measurement], count: int, starts: list[str]) -> None:
+    said = paragraph(replace(few[0], effects=(NAMED,) * count), [])
+    assert re.findall(r"([A-Z][a-z]+(?: effect| one)? is) tls\.", said) == starts
 
 
 def test_each_of_several_effects_says_what_it_takes_away(few: tuple[GapDiagnosis, Measurement]) -> None:

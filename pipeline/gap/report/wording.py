@@ -99,7 +99,7 @@ def _findings(found: GapDiagnosis, rows: list[dict[str, Any]]) -> list[str]:
     parts.append(verdict_in_words(found))
     scale = estimate_scale(found)
     parts += [] if scale is None else [scale.words]
-    parts += [_describe_effect(effect) for effect in found.effects]
+    parts += _describe_effects(found.effects)
     return [*parts, describe_misfit(found.effects, found.evidence), _largest_disagreement(found, rows)]
 
 
@@ -107,9 +107,9 @@ def _describe_closed_gap(found: GapDiagnosis) -> str:
     """How much of the gap closes, if something was named."""
     if found.gap is None or found.gap.closed is None or not found.model_changed:
         return ""
-    return (
-        f"With it in the model, {describe_closing(found.gap, found.model_changed)} on validation blocks, which no fit had used."
-    )
+    what = "them" if len(found.effects) > 1 else "it"
+    closed = describe_closing(found.gap, found.model_changed)
+    return f"With {what} in the model, {closed} on validation blocks, which no fit had used."
 
 
 def _side_notes(found: GapDiagnosis) -> list[str]:
@@ -242,16 +242,23 @@ def format_value(key: str, value: Any, std: float | None) -> str:
     return format_with_std(key, value, std)
 
 
-def _describe_effect(effect: NamedEffect) -> str:
-    """Sentence on one named effect."""
-    if effect.kind == "empirical":
-        return f"The disagreement {_describe_empirical(effect)}; {effect.name} describes it but does not explain it."
-    said = f"It is {effect.name} ({format_parameters(effect)})."
-    return (
-        f"{said} It cannot be told from {', '.join(effect.indistinguishable)}; to separate them: {effect.split_by}."
-        if effect.indistinguishable
-        else said
-    )
+def _describe_effects(effects: Sequence[NamedEffect]) -> list[str]:
+    """Sentences on the named effects."""
+    physical = [effect for effect in effects if effect.kind != "empirical"]
+    starts = iter(["It is"] if len(physical) == 1 else ["One effect is", *["Another one is"] * len(physical)])
+    return [
+        f"The disagreement {_describe_empirical(effect)}; {effect.name} describes it but does not explain it."
+        if effect.kind == "empirical"
+        else f"{next(starts)} {effect.name} ({format_parameters(effect)}).{_describe_alternatives(effect)}"
+        for effect in effects
+    ]
+
+
+def _describe_alternatives(effect: NamedEffect) -> str:
+    """Sentence on the effects from which a named one cannot be told, after a space; "" if there are none."""
+    if not effect.indistinguishable:
+        return ""
+    return f" It cannot be told from {', '.join(effect.indistinguishable)}; to separate them: {effect.split_by}."
 
 
 def _describe_empirical(effect: NamedEffect) -> str:
