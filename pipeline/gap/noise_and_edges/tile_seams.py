@@ -78,7 +78,7 @@ class _SeamDifferences:
 
     @classmethod
     def of(cls, along: FloatArray, beside: FloatArray, raster: FloatArray) -> _SeamDifferences:
-        """Compute them from a raster (r, c), NaN where there is no point."""
+        """Compute the differences of a raster (r, c), whose cells without a point are NaN, along its rows."""
         found = np.diff(raster, axis=1)
         known = ~np.isnan(found)
         most = _CLIP_SIGMAS * nmad(found[known]) if known.any() else 0.0

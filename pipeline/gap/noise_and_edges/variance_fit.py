@@ -52,7 +52,7 @@ class VarianceCandidate:
         return name, float(np.sqrt(theta)) * size
 
     def standard_deviations(self, theta: FloatArray, error: FloatArray) -> dict[str, float]:
-        """Return the standard deviations of a noise effect's parameters by name, from those (k,) of the factors theta (k,).
+        """Convert standard deviations `error` (k,) of the factors theta (k,) to those of the noise effect's parameters, by name.
 
         If a factor is below its standard deviation, the parameter may be 0. The size at which the factor equals its standard
         deviation is then returned instead.
