@@ -146,7 +146,7 @@ class Candidate:
             raise TypeError(f"candidate {self.name} is not a sine")
         return self.wave
 
-    def columns_given(self, coefficients: FloatArray | None) -> FloatArray:
+    def columns_with_derivative(self, coefficients: FloatArray | None) -> FloatArray:
         """Return the design columns of a candidate, and for a sine with known coefficients the derivative by its frequency.
 
         coefficients: (2,) present coefficients of the sine and the cosine column; None: no correction of a frequency is fitted.

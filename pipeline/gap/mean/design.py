@@ -375,7 +375,7 @@ class Design:
     def _matrices(self, candidates: list[Candidate], wave_coefficients: Sequence[FloatArray | None] = ()) -> list[FloatArray]:
         """Columns of each candidate over sigma, with a sine's derivative by its frequency if its coefficients are given."""
         rows, root, given = self.model.rows, self.model.inverse_sigma[:, None], wave_coefficients or [None] * len(candidates)
-        return [each.columns_given(known)[rows] * root for each, known in zip(candidates, given, strict=True)]
+        return [each.columns_with_derivative(known)[rows] * root for each, known in zip(candidates, given, strict=True)]
 
 
 def _columns(model: MeanModel, pose: FloatArray, plain: list[Candidate], place: Mapping[Candidate, list[int]]) -> FloatArray:

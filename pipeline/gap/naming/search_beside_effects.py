@@ -51,7 +51,7 @@ def repeat_search(given: SearchInput, before: SearchOutcome, known_effects: list
     periodic = [(PERIODIC[name], each.candidate) for each in known if (name := each.candidate.name) in PERIODIC]
     families += [harmonics(covariate, sine, last) for covariate, sine in periodic for last in HARMONIC_ORDERS]
     pose = at.pose_jacobian.shape[1]
-    columns = [each.candidate.columns_given(None if each.candidate.wave is None else each.values[:2]) for each in known]
+    columns = [each.candidate.columns_with_derivative(None if each.candidate.wave is None else each.values[:2]) for each in known]
     precision = [prior_precision(each.candidate, matrix.shape[1]) for each, matrix in zip(known, columns, strict=True)]
     search = MeanSearch(
         replace(with_variance_refitted(given, at), pose_jacobian=np.concatenate([at.pose_jacobian, *columns], axis=1)),

@@ -160,7 +160,8 @@ def describe_weakness(item: NamedEffect) -> str:
     gain = f"{item.gain:.1f} in log-likelihood on validation blocks"
     if item.kind != "physical":
         share = f"{100 * thresholds().mean.class_share:g} %"
-        return f"it gains only {gain}, less than {share} of what the strongest effect gains, whose form may be inexact by so much"
+        most = f"less than {share} of what the strongest effect gains"
+        return f"it gains only {gain}, {most}; the form of that effect may be wrong by as much"
     if _is_consistent_with_zero(item):
         return "its value is within its uncertainty of zero"
     if item.gain <= thresholds().variance.least_gain:

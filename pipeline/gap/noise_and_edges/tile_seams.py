@@ -297,7 +297,11 @@ def _most_significant(trials: FloatArray) -> tuple[FloatArray, int]:
 
 
 def _seam_score(axes: tuple[_SeamDifferences, _SeamDifferences], side: float) -> float:
-    """Sum of the normal scores of all seams, standardised; 0 if there are too few, or if those of one axis do not rank high."""
+    """How far the jumps at the seams of tiles of one side rank above those at other lines of cells, in standard deviations.
+
+    It is the sum of the seams' normal scores (normal quantiles of their ranks) over the root of their number; 0 if there are too
+    few seams, or if those along one axis do not rank high by themselves. side: side of a tile, px.
+    """
     of_axes = [each.seam_scores(side) for each in axes]
     scores = np.concatenate(of_axes)
     enough = len(scores) >= _FEWEST_SEAMS and all(each.sum() > _LEAST_AXIS_SIGMAS * np.sqrt(len(each)) for each in of_axes)
