@@ -210,6 +210,7 @@ class StereoMeasurement(MeasurementBase):
     Attributes
     ----------
     cameras : Nominal calibration and poses, world frame.
+    matches : (n, 3) column and row of each point in the left image, and its disparity, px; None if not computed.
     shaped_px : (n,) change of each point's disparity, px, by effects that depend on neighbouring pixels, such as smoothing.
         Like `surroundings`, it holds for poses close to the present ones, and is None if it was not computed.
     surroundings : What the cameras see around each point.
@@ -218,13 +219,15 @@ class StereoMeasurement(MeasurementBase):
     sensor = "stereo"
     model: StereoModel
     cameras: CameraPair
+    matches: FloatArray | None = None
     shaped_px: FloatArray | None = None
     surroundings: Surroundings | None = None
 
     def part(self, rows: NDArray[np.int64]) -> Self:
         """Return the measurement with only the points whose indices are in `rows`, and what the cameras see around them."""
-        shaped = None if self.shaped_px is None else self.shaped_px[rows]
-        return super().part(rows).changed(shaped_px=shaped, surroundings=self.surroundings and self.surroundings.part(rows))
+        matches, shaped = (None if values is None else values[rows] for values in (self.matches, self.shaped_px))
+        surroundings = self.surroundings and self.surroundings.part(rows)
+        return super().part(rows).changed(matches=matches, shaped_px=shaped, surroundings=surroundings)
 
     @property
     def viewpoint(self) -> FloatArray:

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import cache
 from itertools import combinations
 
 import numpy as np
@@ -28,6 +29,8 @@ from sensors.effects.base import ShowsIn
 _POINTS_PER_PATCH = 30.0
 _ROUNDING = 1e-9
 """Relative rounding error of a sum."""
+_FEWEST_POINTS = 100
+"""Fewest validation points for effects to be scored."""
 
 
 @dataclass(frozen=True)
@@ -89,28 +92,36 @@ def validate_effects(
     reference_sigma : standard deviation of the error of the reference surface, in the unit of the observable (m or px).
     blocks : the large squares of the wall (wall blocks), each of which is used as a whole for fits or for validation.
     """
-    scorable = [item for item in named if item.effect.scored()]
-    if not scorable or (~training).sum() < 100:
-        return ValidatedEffects(named, [], [])
-    with_all = _registered_residuals(measurement, named, residuals, training)
     shared = float(np.mean(residuals.with_sigma_of_means.sigma**2 - residuals.sigma**2)) / _POINTS_PER_PATCH
     patch_sigma = float(np.sqrt(reference_sigma**2 + shared))
     block = blocks.numbers(residuals.wall_xy)
 
-    def gains(out: Sequence[NamedEffect]) -> FloatArray:
-        """Validation gain of some effects in each wall block."""
-        without = _registered_residuals(measurement, [each for each in named if each not in out], residuals, training)
+    @cache
+    def registered(kept: frozenset[int]) -> _RegisteredResiduals:
+        return _registered_residuals(measurement, [each for each in named if id(each) in kept], residuals, training)
+
+    def gains(tested: Sequence[NamedEffect], among: Sequence[NamedEffect]) -> FloatArray:
+        """Validation gain in each wall block of effects among others, which stay in the model."""
+        every, out = frozenset(map(id, among)), frozenset(map(id, tested))  # two empirical terms may have one name
+        with_all, without = registered(every), registered(every - out)
         known = np.isfinite(with_all.value) & np.isfinite(without.value)
         return _log_score_gains(with_all, without, known & ~training, residuals.wall_xy, block, patch_sigma)
 
-    found = {id(item): gains([item]) for item in scorable}  # two empirical terms may have one name
+    return _sorted_by_gain(named, gains) if (~training).sum() >= _FEWEST_POINTS else ValidatedEffects(named, [], [])
+
+
+def _sorted_by_gain(
+    named: list[NamedEffect], gains: Callable[[Sequence[NamedEffect], Sequence[NamedEffect]], FloatArray]
+) -> ValidatedEffects:
+    """Sort effects by their gains. gains: function that returns the gain in each wall block of effects among others."""
+    scorable = [item for item in named if item.effect.scored()]
+    found = {id(item): gains([item], named) for item in scorable}
     total = {number: float(each.sum()) for number, each in found.items()}
     strongest_first = sorted((item for item in scorable if not item.adds_variance), key=lambda item: -total[id(item)])
     for group in _groups(strongest_first):
-        if gains(group).sum() <= 0:
+        if gains(group, named).sum() <= 0:
             out = min(group, key=lambda item: (item.kind != "empirical", total[id(item)]))
-            rest = [each for each in named if each is not out]
-            left = validate_effects(measurement, residuals, rest, training, reference_sigma, blocks)
+            left = _sorted_by_gain([each for each in named if each is not out], gains)
             return ValidatedEffects(left.named, [out, *left.failed], left.weak)
     failed = [item for item in scorable if total[id(item)] <= item.effect.held_out_gain]
     kept = [item for item in named if item not in failed]

@@ -52,7 +52,7 @@ from pipeline.gap.residuals.alignment import align, compute_residuals, fit_pose_
 from pipeline.gap.residuals.residuals import BoolArray, Residuals
 from pipeline.gap.residuals.scene_changes import SceneChange, moved_share
 from pipeline.gap.residuals.sensor_view import SensorView
-from pipeline.gap.residuals.stereo_residuals import StereoResiduals, with_surroundings
+from pipeline.gap.residuals.stereo_residuals import StereoResiduals, with_matches, with_surroundings
 from pipeline.gap.residuals.subsampling import subsample_measurement
 from pipeline.gap.residuals.surface_residuals import SurfaceResiduals
 from pipeline.gap.residuals.tls_residuals import TlsResiduals, find_expected_pulses, with_scan_order
@@ -160,10 +160,19 @@ def diagnose(
     clock, random = _Clock(progress), KeyedRandom(seed, ("gap",))
     # one BLAS thread: results do not depend on the number of threads, and no threads wait for each other
     with use_thresholds(thresholds), threadpool_limits(1, "blas"):
-        ordered = with_scan_order(measurement) if isinstance(measurement, TlsMeasurement) else measurement
-        part, rows = subsample_measurement(ordered, random.child("thinned"))
+        part, rows = subsample_measurement(_prepared(measurement), random.child("thinned"))
         found = _diagnose(part, clock, random)
     return replace(found, residuals=replace(found.residuals, index=rows[found.residuals.index]))
+
+
+def _prepared(measurement: Measurement) -> Measurement:
+    """Store in a measurement what no pose changes: scan lines and times, or the disparities of a stereo pair."""
+    match measurement:
+        case TlsMeasurement():
+            return with_scan_order(measurement)
+        case StereoMeasurement():
+            return with_matches(measurement)
+    return measurement
 
 
 def _diagnose(measurement: Measurement, clock: _Clock, random: KeyedRandom) -> GapDiagnosis:

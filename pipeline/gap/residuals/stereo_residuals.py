@@ -114,8 +114,7 @@ def stereo_residuals(measurement: StereoMeasurement) -> StereoResiduals:
     the reference are left out.
     """
     nominal, model = NominalPair.of(measurement), measurement.model
-    u, v, points = _pixels(nominal, measurement)
-    measured = nominal.disparity(project(nominal.pair.left, points), project(nominal.pair.right, points))
+    u, v, measured = (_matches(measurement) if measurement.matches is None else measurement.matches).T
     real = real_pair(model.effects, measurement)
     geometry, depth = _reference(nominal, real, measurement.scene, u, v, measured)
     cell_px = raster_cell_px(u, v)
@@ -144,6 +143,11 @@ def stereo_residuals(measurement: StereoMeasurement) -> StereoResiduals:
     return whole if hit.all() else whole.part(hit)
 
 
+def with_matches(measurement: StereoMeasurement) -> StereoMeasurement:
+    """Store the pixels and the disparities of a stereo measurement in it, to save computing them for each pose of the cameras."""
+    return measurement.changed(matches=_matches(measurement))
+
+
 def with_surroundings(measurement: StereoMeasurement, found: StereoResiduals) -> StereoMeasurement:
     """Store in a stereo measurement what the rock is like around the place that each pixel sees, to save tracing it again.
 
@@ -162,13 +166,16 @@ def _has_pixels(measurement: StereoMeasurement) -> bool:
     return "pixel_x" in measurement.cloud.extra and "pixel_y" in measurement.cloud.extra
 
 
-def _pixels(nominal: NominalPair, measurement: StereoMeasurement) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Column and row (n,) of each point in the left image, px, and the points (n, 3) on the rays of these pixels."""
-    points, left = measurement.cloud.points, nominal.pair.left
-    if not _has_pixels(measurement):
-        return *project(left, points), points
-    u, v = (np.asarray(measurement.cloud.extra[key], dtype=np.float64) for key in ("pixel_x", "pixel_y"))
-    return u, v, move_onto_rays(left, points, u, v)
+def _matches(measurement: StereoMeasurement) -> FloatArray:
+    """(n, 3) column and row of each point in the left image, and its disparity, px."""
+    points, nominal = measurement.cloud.points, NominalPair.of(measurement)
+    left, right = nominal.pair.left, nominal.pair.right
+    if _has_pixels(measurement):
+        u, v = (np.asarray(measurement.cloud.extra[key], dtype=np.float64) for key in ("pixel_x", "pixel_y"))
+        points = move_onto_rays(left, points, u, v)
+    else:
+        u, v = project(left, points)
+    return np.stack([u, v, nominal.disparity(project(left, points), project(right, points))], axis=1)
 
 
 def _notes(given: bool, u: FloatArray, v: FloatArray, cell_px: float | None) -> tuple[str, ...]:

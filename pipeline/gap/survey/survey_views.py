@@ -280,7 +280,7 @@ def _pair_observer(quality: Quality) -> Callable[[StereoMeasurement, int], Surve
         valid = np.isfinite(some).all(axis=1)
         pixels = {"pixel_x": (columns.ravel() + 0.5) * step, "pixel_y": (rows.ravel() + 0.5) * step}
         cloud = PointCloud(some[valid], extra={name: values[valid] for name, values in pixels.items()})
-        measurement = base.changed(cloud=cloud, surroundings=None)
+        measurement = base.changed(cloud=cloud, matches=None, surroundings=None)
         whole = int(valid.sum() * stride**2 * (step / REDUCTION[quality]) ** 2)
         return SurveyView.of(stereo_residuals(measurement), whole, number, measurement)
 
