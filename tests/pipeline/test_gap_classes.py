@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
 
@@ -15,14 +14,11 @@ from pipeline.gap.naming import nonlinear_refit
 from pipeline.gap.naming.named_effects import Estimate
 from pipeline.gap.naming.nonlinear_refit import (
     _best_variants,
-    _ExplanationFit,
     _gain_over,
     _ranked_on_common_points,
-    _search_beside_others,
     _SingleFit,
     _with_equivalence_class,
 )
-from pipeline.gap.naming.search_beside_effects import search_at_joint_fit
 from pipeline.gap.naming.search_outcome import SearchOutcome
 
 CHI2: Any = SimpleNamespace(design=SimpleNamespace(log_likelihood=lambda value, _: -0.5 * float(value @ value)))
@@ -97,48 +93,16 @@ def outcome(estimates: list[Estimate], together: bool = True, p_value: float | N
     return SearchOutcome(first if together else first[:1], estimates, search, Any, [], ())  # type: ignore[arg-type]
 
 
-@pytest.mark.parametrize(("further", "named", "alike"), [(1, "b", ("d",)), (2, "a", ("b",)), (0, "d", ("b",))])
-def test_another_fit_that_needs_fewer_further_effects_replaces_the_best(
-    monkeypatch: pytest.MonkeyPatch, further: int, named: str, alike: tuple[str, ...]
-) -> None:
-    """Beside a, which fits best, two effects gain 200 each. Fit b is worse by 50, so it may belong to them; c, by 450, may not.
-
-    Effect d fits as well as b, and so belongs to its class. Fitted together with the further effects, b is worse than a by 2
-    and d by 8, so b is an alternative to a. If b and d need none of them, d wins, which is then better by 8.
-    """
-    fits = [fit(name, [float(np.sqrt(2 * worse))], [True]) for name, worse in (("a", 0), ("b", 50), ("d", 51), ("c", 450))]
-    best, tried = outcome([estimated(name) for name in "axy"], together=False), []
-
-    def beside(_: Any, chosen: SearchOutcome) -> SearchOutcome:
-        tried.append(chosen.estimates[0].candidate.name)
-        return outcome([*chosen.estimates, *(estimated(name) for name in "xy"[:further])], together=False)
-
-    def joint_fit(_: Any, found: SearchOutcome) -> _ExplanationFit:
-        worse = {"a": 0, "b": 2 if further else 16, "d": 8}[found.estimates[0].candidate.name]
-        return _ExplanationFit(found, [], np.array([np.sqrt(2.0 * worse)]), np.array([True]))
-
-    monkeypatch.setattr(nonlinear_refit, "_search_beside", beside)
-    monkeypatch.setattr(nonlinear_refit, "_within_bounds", lambda *_: True)
-    monkeypatch.setattr(_ExplanationFit, "of", joint_fit)
-    given: Any = None
-    first = _search_beside_others(given, replace(best, search=CHI2), fits, best).estimates[0]
-    assert tried == ["b", "d"]
-    assert first.candidate.name == named
-    assert first.chosen.indistinguishable == alike
-
-
 @pytest.mark.parametrize(("left_by_a", "left_by_b", "named"), [(0.4, 0.002, "a"), (0.4, 0.3, "b"), (0.002, 0.002, "b")])
 def test_fewer_effects_are_no_alternative_if_they_leave_a_misfit_that_more_do_not(
     monkeypatch: pytest.MonkeyPatch, left_by_a: float, left_by_b: float, named: str
 ) -> None:
-    """Beside fit a, which is best, one more effect is found, beside fit b none."""
+    """The best explanation has two effects, another one has one."""
     best = outcome([estimated("a"), estimated("x")], together=False, p_value=left_by_a)
     alone = outcome([estimated("b")], p_value=left_by_b)
     monkeypatch.setattr(nonlinear_refit, "_search_beside", lambda *_: alone)
     monkeypatch.setattr(nonlinear_refit, "_within_bounds", lambda *_: True)
     nothing: Any = None
-    found = _search_beside_others(nothing, best, [fit("a", [0.0], [True]), fit("b", [1.0], [True])], best)
-    assert found.estimates[0].candidate.name == named
     assert nonlinear_refit._simpler(nothing, best, alone, ties=False) is (best if named == "a" else alone)
 
 
@@ -153,9 +117,3 @@ def test_effects_of_an_explanation_keep_the_classes_of_the_linearised_search_unl
     assert refitted.estimates[0].chosen.indistinguishable == ("a", "b")
     other = outcome([estimated("x"), estimated("z")])
     assert other.with_classes_of(linear) is other
-
-
-def test_without_effects_of_the_catalogue_there_is_no_joint_fit() -> None:
-    """Surfaces without cameras have empirical terms only."""
-    given: Any = SimpleNamespace(families=[Candidate("x", np.zeros((1, 1)), lambda _: {}, ("a",), empirical=True)])
-    assert search_at_joint_fit(given) is None

@@ -15,9 +15,8 @@ from gap_cases import write_scan
 from benchmarks.gap_closed_form import stereo_cases
 from benchmarks.gap_closed_form.cases import Case, make
 from benchmarks.gap_closed_form.strength import Strength, Target
-from pipeline.change.robust import nmad
 from pipeline.formats.measurements.measurement import read_measurement
-from pipeline.gap.mean.candidates import Candidate, SineGrid
+from pipeline.gap.mean.candidates import Candidate
 from pipeline.gap.mean.design import Design
 from pipeline.gap.mean.mean_model import MeanModel, fit_reml
 from pipeline.gap.mean.search import MeanSearch
@@ -31,19 +30,15 @@ from pipeline.gap.naming.nonlinear_refit import (
     _with_equivalence_class,
     select_and_refit,
 )
-from pipeline.gap.naming.search_beside_effects import _JointFit, fit_jointly, search_at_joint_fit
 from pipeline.gap.naming.search_outcome import SearchInput, SearchOutcome
 from pipeline.gap.naming.search_residuals import with_fitted_variance
 from pipeline.gap.naming.selection_passes import PassInput, PassInputs
 from pipeline.gap.naming.validation_scores import describe_weakness, validate_effects
 from pipeline.gap.naming.workflow import diagnose
-from pipeline.gap.noise_and_edges.variance_model import VarianceTerm, fit_variance_model
-from pipeline.gap.residuals.alignment import align, fit_pose_robustly
-from pipeline.gap.residuals.residuals import Residuals
+from pipeline.gap.residuals.alignment import align
 from pipeline.gap.residuals.wall_blocks import BlockGrid, WallCells
 from pipeline.gap.thresholds import Thresholds, use_thresholds
 from scene.common.keyed_random import KeyedRandom
-from scene.geometry.mesh import FloatArray
 
 
 class _Strong(Target):
@@ -109,73 +104,6 @@ def turned_and_zoomed(tmp_path_factory: pytest.TempPathFactory) -> tuple[SearchI
     part = residuals.part(residuals.usable)
     there, part = there.part(part.index), replace(part, index=np.arange(residuals.usable.sum()))
     return SearchInput(there, part, candidate_families(there, part), lambda _: [], 0.0, KeyedRandom(1)), truth
-
-
-def test_slopes_are_the_true_ones_where_all_effects_together_fit_best(
-    turned_and_zoomed: tuple[SearchInput, dict[str, dict[str, Any]]],
-) -> None:
-    """With the Jacobian at the joint fit, least squares finds both effects to 15 %, two to three standard errors.
-
-    With the Jacobian at the model without effects, it misses a third of one of them.
-    """
-    points, truth = turned_and_zoomed
-
-    def both(families: list[Candidate | SineGrid], part: Residuals, value: FloatArray) -> list[float]:
-        physical = [each for each in families if isinstance(each, Candidate) and not each.empirical]
-        chosen = [each for each in physical if each.name in truth and each.fixed["camera"] == truth[each.name]["camera"]]
-        columns = np.concatenate([part.pose_jacobian, *(each.columns for each in chosen)], axis=1) / part.sigma[:, None]
-        found = np.linalg.lstsq(columns, value / part.sigma, rcond=None)[0][6:]
-        wanted = [next(v for key, v in truth[each.name].items() if key != "camera") for each in chosen]
-        return [abs(one / other - 1) for one, other in zip(found, wanted, strict=True)]
-
-    assert max(both(points.families, points.part, points.part.value)) > 0.3
-    fit_reml = fit_jointly(points, [each for each in points.families if isinstance(each, Candidate) and not each.empirical])
-    assert fit_reml is not None
-    there, at, explained = fit_reml
-    assert max(both(candidate_families(there, at), at, at.value + explained)) < 0.15
-
-
-@pytest.mark.parametrize(
-    ("squares", "kept"), [((1.0, 4.0, 2.0, 3.0), 2.0), ((9.0, 4.0, 3.99, 3.0), 3.99), ((1.0, 4.0, 2.0, 1.999), 1.999)]
-)
-def test_a_joint_fit_ends_with_its_best_step(monkeypatch: pytest.MonkeyPatch, squares: tuple[float, ...], kept: float) -> None:
-    """A step that makes the residuals larger is dropped, but not the first; one that makes them smaller by 0.25 % is the last."""
-
-    def step(number: int) -> Any:
-        return SimpleNamespace(
-            mean_square_beside=lambda _: squares[number],
-            residuals=squares[number],
-            measurement=None,
-            candidates=[SimpleNamespace(columns=np.zeros((1, 1)))],
-            values=np.zeros(1),
-            stepped=lambda _: step(number + 1),
-        )
-
-    monkeypatch.setattr(_JointFit, "start", lambda *_: step(0))
-    given: Any = None
-    fitted = fit_jointly(given, [])
-    assert fitted is not None
-    assert fitted[1] == kept
-
-
-def test_noise_beside_effects_is_asked_for_with_these_in_the_model(
-    turned_and_zoomed: tuple[SearchInput, dict[str, dict[str, Any]]],
-) -> None:
-    """If the effects, hundreds of times the noise, are not in the model, they are found as noise of some pixels.
-
-    With them in the model no noise is found, and the residuals' NMAD is as predicted; it is known to 2 % from 3,000 values.
-    """
-    points, _ = turned_and_zoomed
-    asked: list[Residuals] = []
-    search_at_joint_fit(replace(points, variance_at=lambda at: asked.append(at) or []))  # type: ignore[func-returns-value]
-    (at,) = asked
-
-    def noise_in(part: Residuals) -> list[VarianceTerm]:
-        return fit_variance_model(part, WallCells.over(part.wall_xy), fit_pose_robustly(part)[0], KeyedRandom(1), frozenset())[0]
-
-    assert noise_in(points.part)
-    assert noise_in(at) == []
-    assert nmad(fit_pose_robustly(at)[0] / at.sigma) == pytest.approx(1.0, abs=0.1)
 
 
 def test_the_class_of_an_effect_taken_exactly_is_by_exact_likelihoods(
@@ -257,7 +185,6 @@ def test_effects_are_tried_one_by_one_where_several_weak_ones_seem_needed(
 
     monkeypatch.setattr(nonlinear_refit, "_search_beside_best", beside_best)
     monkeypatch.setattr(nonlinear_refit, "_search_beside", lambda *_: None)
-    monkeypatch.setattr(nonlinear_refit, "search_at_joint_fit", lambda _: None)
     for fewer in (0, 1):
         found = select_and_refit(points, first)
         assert (found is tried[-1]) == (fewer > 0)
@@ -346,17 +273,6 @@ def test_rock_that_moved_is_no_large_effect(tmp_path: Path) -> None:
 def _with_moved_share(share: float) -> Thresholds:
     changes = Thresholds().changes.model_copy(update={"moved_share": share})
     return Thresholds().model_copy(update={"changes": changes})
-
-
-def test_two_large_effects_are_found_where_all_together_fit_best(
-    turned_and_zoomed: tuple[SearchInput, dict[str, dict[str, Any]]],
-) -> None:
-    """Linearised at the model, two other effects and a free form would be found instead."""
-    found = search_at_joint_fit(turned_and_zoomed[0])
-    assert found is not None
-    assert {each.candidate.name for each in found.chosen} <= {"focal_length", "camera_kappa", "affinity_skew"}  # a turn is a skew
-    assert [each.candidate.name for each in found.chosen].count("focal_length") == 1
-    assert len(found.chosen) == 2
 
 
 def test_what_is_known_before_shrinks_a_coefficient_as_bayes_says() -> None:

@@ -7,7 +7,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from pipeline.gap.noise_and_edges.pixel_locking import Locking, NoiseBounds, find_locking
+from pipeline.gap.noise_and_edges.pixel_locking import NoiseBounds, find_locking
 from sensors.effects.pixel_locking import PixelLocking
 
 
@@ -123,15 +123,6 @@ def test_amplitude_is_found_whether_noise_comes_before_or_after_the_locking(
     assert found.amplitude_px == pytest.approx(2 * amplitude, abs=max(3 * found.std_px, 0.004))
     assert found.std_px < 0.2 * found.amplitude_px
     assert found.period_px == pytest.approx(2, rel=1e-3)
-
-
-def test_the_amplitude_grows_to_explain_more_variance_only_within_its_uncertainty() -> None:
-    """A sine of amplitude A has the variance A^2 / 2."""
-    found = Locking(0.10, 0.03, 1.0, 0.0, 0.0, 100.0)
-    larger = found.with_variance(0.002)
-    assert larger is not None
-    assert larger.amplitude_px**2 / 2 == pytest.approx(0.1**2 / 2 + 0.002)
-    assert found.with_variance(0.02) is None
 
 
 def test_disparities_that_crowd_at_other_frequencies_too_show_no_locking() -> None:

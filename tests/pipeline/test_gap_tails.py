@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 from pipeline.gap.mean.selection import SelectedEffect
-from pipeline.gap.naming import effect_selection, workflow
+from pipeline.gap.naming import workflow
 from pipeline.gap.naming.effect_selection import keep_implausible_in_class
-from pipeline.gap.naming.named_effects import NamedEffect, absorbed_by_registration
+from pipeline.gap.naming.named_effects import NamedEffect
 from pipeline.gap.noise_and_edges.heavy_tails import find_heavy_tails
 from pipeline.gap.residuals.wall_blocks import BlockGrid
 from sensors.effects.range_noise import RangeNoise
@@ -83,32 +83,6 @@ def test_what_far_points_gain_is_a_log_likelihood_and_not_their_number() -> None
 
     mixed = (1 - share) * density(cut, 1.0) + share * density(cut, wide)
     assert found.gain == pytest.approx(np.sum(np.log(mixed / density(cut, 1.0))), rel=1e-6)
-
-
-def _estimate(monkeypatch: pytest.MonkeyPatch, amplitude: float) -> Any:
-    entry = {"name": "horizontal_eccentricity", "amplitude_rad": amplitude, "phase_rad": 0.0}
-    monkeypatch.setattr("pipeline.gap.naming.named_effects.effect_from_estimate", lambda *_: SimpleNamespace(entry=entry))
-    return SimpleNamespace(candidate=SimpleNamespace(name="horizontal_eccentricity", empirical=False))
-
-
-@pytest.mark.parametrize(("amplitude", "left", "out"), [(3.8e-3, 0.04, True), (3.8e-3, 0.4, False), (2e-4, 0.04, False)])
-def test_an_effect_that_registration_undoes_is_not_believed_at_38_times_its_size(
-    monkeypatch: pytest.MonkeyPatch, amplitude: float, left: float, out: bool
-) -> None:
-    found = absorbed_by_registration([_estimate(monkeypatch, amplitude)], Any, {"horizontal_eccentricity": left})  # type: ignore[arg-type]
-    assert found == (frozenset({("horizontal_eccentricity", False)}) if out else frozenset())
-
-
-@pytest.mark.parametrize(
-    ("p_value", "empirical", "all_of_it"), [(0.4, False, True), (0.01, False, False), (None, False, False), (0.4, True, False)]
-)
-def test_such_an_effect_stands_where_it_leaves_no_more_than_chance(
-    p_value: float | None, empirical: bool, all_of_it: bool
-) -> None:
-    """An effect that is implausibly large is kept if it leaves nothing; one that only looks similar has another signature."""
-    estimate = SimpleNamespace(candidate=SimpleNamespace(empirical=empirical))
-    found: Any = SimpleNamespace(p_value=p_value, estimates=[estimate])
-    assert effect_selection._explains_everything(found) is all_of_it
 
 
 def test_an_effect_that_is_not_believed_stays_in_the_class_of_what_looks_like_it() -> None:

@@ -209,23 +209,12 @@ class ForwardSelection:
             term = SelectedEffect(form.candidate, (), p_value, ratio, form.score, empty.family_scores)
             chosen = [*(self.with_equivalents(members, item, scores) for item in members), term]
             return chosen, self.search.score_families((*members, form))
-        best, chosen = self._drop_below_spatial_null(levels[-1][0], scores)
+        best = levels[-1][0]
         nearly, weak = (1 - thresholds().mean.class_share) * empty.spatial_null_score, empty.nonparametric
         unreported = weak.score if weak is not None and weak.score < _least_nonparametric_score() else 0.0
         if best.score <= max(nearly, unreported):  # no effect of the catalogue explains it as well
             return [], empty.family_scores
-        return chosen, best.family_scores
-
-    def _drop_below_spatial_null(self, found: _Set, scores: SetScores) -> tuple[_Set, list[SelectedEffect]]:
-        """Drop effects that score no better beside the others than a spatial null candidate does beside all of them."""
-        chosen = [self.with_equivalents(found.members, item, scores) for item in found.members]
-        least = min(chosen, key=lambda each: each.score, default=None)
-        if least is None or least.score > found.spatial_null_score:
-            return found, chosen
-        members = tuple(item for item, each in zip(found.members, chosen, strict=True) if each is not least)
-        return self._drop_below_spatial_null(
-            _Set(members, found.score - least.score, self.search.score_families(members)), scores
-        )
+        return [self.with_equivalents(best.members, item, scores) for item in best.members], best.family_scores
 
     def _grow(self, level: list[_Set]) -> tuple[list[_Set], SetScores]:
         """The best sets with one more effect, best first, and the score of each set that was considered."""

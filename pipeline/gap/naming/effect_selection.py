@@ -19,7 +19,6 @@ from pipeline.gap.mean.selection import FamilyScore, SelectedEffect
 from pipeline.gap.naming.candidate_families import candidate_families, model_has
 from pipeline.gap.naming.named_effects import (
     NamedEffect,
-    absorbed_by_registration,
     aligned_with,
     effect_from_estimate,
     effect_from_locking,
@@ -46,7 +45,6 @@ from pipeline.gap.residuals.residuals import Residuals
 from pipeline.gap.residuals.stereo_residuals import StereoResiduals
 from pipeline.gap.residuals.tls_residuals import TlsResiduals
 from pipeline.gap.residuals.wall_blocks import WallCells
-from pipeline.gap.thresholds import thresholds
 from scene.common.keyed_random import KeyedRandom
 from scene.geometry.mesh import FloatArray
 from sensors.effects.angle_empirical import AngleEmpirical
@@ -127,7 +125,6 @@ class SelectionInput:
         them. None: there is no such error, and the registered residuals serve.
     grid_noise : noise that neighbouring points share, if a preceding selection found it in its residuals. It is then part of
         the model from the start, because it imitates empirical terms and errors of the reference. None in a first selection.
-    locking : pixel locking whose amplitude a preceding selection found with the noise. None: it is searched for.
     """
 
     measurement: Measurement
@@ -137,7 +134,6 @@ class SelectionInput:
     excluded: frozenset[tuple[str, bool]] = frozenset()
     noise: FloatArray | None = None
     grid_noise: VarianceTerm | None = None
-    locking: Locking | None = None
 
     def registered(self, part: Residuals) -> FloatArray:
         """Return the (n,) residuals to which noise terms are fitted first. part: the residuals, with their predicted noise."""
@@ -171,8 +167,7 @@ def select_effects(given: SelectionInput) -> tuple[list[NamedEffect], SelectionR
     search = SearchInput(measurement, part, families, partial(_noise_terms_at, given, part), apart.variance, random)
     first = MeanSearch(with_fitted_variance(part, noise.terms or known, apart.noise_ratio), families, random)
     found = select_and_refit(search, first)
-    names, _, survival = first.design.identifiability
-    wrong = _implausible_effects(given, found, dict(zip(names, survival, strict=True)))
+    wrong = out_of_bounds(measurement, found.estimates, found.residuals)
     design = found.search.design
     left = design.residuals_after([each.candidate for each in found.further])
     if found.chosen and not wrong:
@@ -181,8 +176,6 @@ def select_effects(given: SelectionInput) -> tuple[list[NamedEffect], SelectionR
         refound, noise = _with_grid_noise(given, part, found, left, noise)
         if refound is not None:
             return select_effects(replace(given, grid_noise=refound))
-    if given.locking is None and (locking := apart.locking_for(noise)):
-        return select_effects(replace(given, locking=locking))
     if wrong := (wrong | noise.implausible(measurement)) - given.excluded:
         again, result = select_effects(given.without(wrong))
         before = frozenset(each.candidate.name for each in found.estimates)
@@ -226,16 +219,10 @@ class _FoundApart:
         if isinstance(part, StereoResiduals) and not model_has(measurement, PixelLocking.tag()):
             at, residual = part.geometry, given.registered(part)
             allowed = NoiseBounds(float(np.median(part.sigma)), nmad(residual))
-            locking = given.locking or find_locking(at.found, at.disparity, at.tangent, at.infinity, allowed, residual)
+            locking = find_locking(at.found, at.disparity, at.tangent, at.infinity, allowed, residual)
             if locking is not None:
                 return cls([effect_from_locking(locking)], locking.amplitude_px**2 / 2, given.noise_ratio, locking)
         return cls([], 0.0, given.noise_ratio)
-
-    def locking_for(self, noise: _FittedNoise) -> Locking | None:
-        """Return the pixel locking with an amplitude that explains the noise found beside it, if that is plausible."""
-        if self.locking is None or len(noise.terms) != 1 or noise.terms[0].empirical or np.ptp(noise.terms[0].variance) > 0:
-            return None
-        return self.locking.with_variance(float(noise.terms[0].variance[0]))
 
 
 @dataclass(frozen=True)
@@ -275,13 +262,6 @@ def _noise_terms_at(given: SelectionInput, part: Residuals, at: Residuals) -> li
     if fitted or given.grid_noise is None:
         return fitted
     return [replace(given.grid_noise, variance=given.grid_noise.variance[np.isin(part.index, at.index)])]
-
-
-def _implausible_effects(given: SelectionInput, found: SearchOutcome, survival: dict[str, float]) -> frozenset[tuple[str, bool]]:
-    """Families of systematic effects that are not to be tried, because their size is implausible."""
-    wrong = out_of_bounds(given.measurement, found.estimates, found.residuals)
-    absorbed = absorbed_by_registration(found.estimates, found.residuals, survival)
-    return wrong | absorbed if absorbed and not _explains_everything(found) else wrong
 
 
 def _with_grid_noise(
@@ -389,12 +369,6 @@ def _detectable_sizes(
     noise = detectable_noise(found.residuals, found.search.design.cells, left, noise_terms, random)
     tiles = [detectable_tile_shift(found.residuals, left)] if isinstance(found.residuals, StereoResiduals) else []
     return (*systematic, *tiles, *noise)
-
-
-def _explains_everything(found: SearchOutcome) -> bool:
-    """Whether only effects of the catalogue were found, and no misfit is left beside them."""
-    physical = not any(each.candidate.empirical for each in found.estimates)
-    return physical and found.p_value is not None and found.p_value > thresholds().verdict.rejection_p
 
 
 def keep_implausible_in_class(

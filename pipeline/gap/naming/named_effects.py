@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -22,7 +22,7 @@ from pipeline.gap.noise_and_edges.variance_model import VarianceTerm
 from pipeline.gap.residuals.alignment import AlignedMeasurement, align
 from pipeline.gap.residuals.residuals import Residuals
 from pipeline.gap.residuals.tls_residuals import TlsResiduals
-from pipeline.gap.thresholds import largest_relative_size, thresholds
+from pipeline.gap.thresholds import largest_relative_size
 from scene.common.config import parse
 from scene.common.errors import InputError
 from scene.geometry.mesh import FloatArray
@@ -433,25 +433,3 @@ def out_of_bounds(measurement: Measurement, estimates: list[Estimate], part: Res
 
     wrong = [each for each in estimates if not is_plausible(effect_from_estimate(each, part).entry)]
     return frozenset((each.candidate.name, each.candidate.empirical) for each in wrong)
-
-
-def absorbed_by_registration(
-    estimates: list[Estimate], part: Residuals, survival: Mapping[str, float]
-) -> frozenset[tuple[str, bool]]:
-    """Find fitted sensor errors (effects) that are large only because the measurement hardly determines their size.
-
-    A shift and rotation of the sensor imitates such an effect almost completely, so the pose fit absorbs it. Two thresholds
-    tell it: a share of less than `mean.absorbed_share` of its signature (the pattern of residuals that it makes) is left beside
-    the pose, and its size is more than one standard deviation of its prior, `mean.prior_size`. Such effects are returned as pairs
-    (name, False); empirical terms are not considered.
-
-    Parameters
-    ----------
-    estimates : effects with fitted coefficients.
-    part : residuals of the points to which the rows of their design columns belong.
-    survival : by effect name, the share of the effect's signature that is left after the pose is fitted, from 0 to 1.
-    """
-    by = thresholds().mean
-    doubtful = [each for each in estimates if not each.candidate.empirical and survival[each.candidate.name] < by.absorbed_share]
-    large = [each for each in doubtful if relative_size(effect_from_estimate(each, part).entry) > by.prior_size]
-    return frozenset((each.candidate.name, False) for each in large)

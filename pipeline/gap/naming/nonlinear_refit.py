@@ -16,10 +16,8 @@ from pipeline.gap.naming.named_effects import Estimate, out_of_bounds
 from pipeline.gap.naming.search_beside_effects import (
     aligned_with_estimates,
     estimates_of,
-    fit_jointly,
     recomputed,
     repeat_search,
-    search_at_joint_fit,
     too_few_left,
 )
 from pipeline.gap.naming.search_outcome import SearchInput, SearchOutcome
@@ -86,33 +84,6 @@ class _SingleFit:
         return _SingleFit.of(given, first, replace(self.estimate, values=self.estimate.values + step))
 
 
-@dataclass(frozen=True)
-class _ExplanationFit:
-    """One explanation, with all its effects fitted together without linearising.
-
-    found: the explanation; candidates: its effects as regression terms; value, used: as of a `_SingleFit`.
-    """
-
-    found: SearchOutcome
-    candidates: list[Candidate]
-    value: FloatArray
-    used: BoolArray
-
-    @classmethod
-    def of(cls, given: SearchInput, found: SearchOutcome) -> _ExplanationFit | None:
-        """Fit the effects; None if one is an empirical term or out of bounds, or if too few rays meet the reference."""
-        if any(each.candidate.empirical for each in found.estimates):
-            return None
-        candidates = [recomputed(each.candidate, given.families) for each in found.estimates]
-        fitted = fit_jointly(given, candidates, _CONVERGED_GAIN / len(given.part))
-        return None if fitted is None else cls(found, candidates, *_registered_residuals(fitted[1], given.part))
-
-    def score(self, first: MeanSearch, common: BoolArray) -> float:
-        """Penalised log-likelihood on some of the points. common: (n,) these points."""
-        penalty = sum(each.chosen.log_likelihood_ratio - each.chosen.score for each in self.found.estimates)
-        return first.design.log_likelihood(np.where(common, self.value, 0.0), self.candidates) - penalty
-
-
 def _on_common_points(fits: list[_SingleFit], first: MeanSearch) -> list[_SingleFit]:
     """Return the fits with their log-likelihoods on the points that all of them use, so that none gains by leaving out points."""
     common, design = np.all([each.used for each in fits], axis=0), first.design
@@ -140,7 +111,7 @@ def select_and_refit(given: SearchInput, first: MeanSearch) -> SearchOutcome:
     The linearised model is inexact for a large effect, and forward selection then adds spurious effects that absorb the
     linearisation error. Several explanations are therefore compared. One is the linearised selection. For another, the strongest
     effects are refitted alone without linearising, and the selection is repeated beside the best one. If that still needs several
-    effects, or if none is strong, each effect is tried alone (`screen_effects`), and all together (`search_at_joint_fit`).
+    effects, or if none is strong, each effect is tried alone (`screen_effects`).
 
     Parameters
     ----------
@@ -163,14 +134,10 @@ def select_and_refit(given: SearchInput, first: MeanSearch) -> SearchOutcome:
             beside_best = _search_beside_best(given, linear, screened) or beside_best
         elif beside_best is not None:
             beside_best = _with_class_of_first(beside_best, screened)
-        if beside_best is not None and len(beside_best.estimates) > 1:
-            beside_best = _search_beside_others(given, linear, screened, beside_best)
     if beside_best is not None and len(beside_best.estimates) == 1:
         return beside_best
     best = beside_best if beside_best is not None and _within_bounds(given, beside_best) else None
     best = _simpler(given, best, linear, ties=not alone)
-    if best is None or best.complexity > (0, 1):
-        best = _simpler(given, best, search_at_joint_fit(given), ties=False)
     return linear if best is None else best.with_classes_of(linear)
 
 
@@ -274,69 +241,6 @@ def _with_class_of_first(found: SearchOutcome, fits: list[_SingleFit]) -> Search
     """Return an explanation whose first effect is the best of some single fits, with its class among these."""
     chosen, (first, *others) = _with_equivalence_class(fits).estimate.chosen, found.estimates
     return replace(found, chosen=[chosen], estimates=[replace(first, chosen=chosen), *others])
-
-
-def _search_beside_others(given: SearchInput, plain: SearchOutcome, fits: list[_SingleFit], best: SearchOutcome) -> SearchOutcome:
-    """Repeat the search beside other effects that were refitted alone: the true set of effects may hold one of these.
-
-    A fit is tried if its log-likelihood is lower than that of the best one by no more than the further effects gain. Its class
-    holds the fits with nearly its score, because the linearised search is inexact for an error of this size. The simplest
-    explanation wins, unless it leaves a misfit that the first one does not leave, and of equally simple ones the most likely one.
-    """
-    gained, found = sum(each.chosen.log_likelihood_ratio for each in best.estimates[1:]), [best]
-    for other in fits[1:]:
-        if fits[0].log_likelihood - other.log_likelihood > gained:
-            continue
-        margin = equivalence_margin(other.estimate.chosen.log_likelihood_ratio)
-        near = (each.name for each in fits if each is not other and abs(each.score - other.score) < margin)
-        chosen = replace(other.estimate.chosen, indistinguishable=tuple(sorted(near)))
-        beside = _search_beside(given, replace(plain, chosen=[chosen], estimates=[replace(other.estimate, chosen=chosen)]))
-        if beside is None or beside.complexity > best.complexity or beside.leaves_more_misfit_than(best):
-            continue
-        if _within_bounds(given, beside):
-            found.append(beside)
-    fewest = min(each.complexity for each in found)
-    return _most_likely(given, plain.search, [each for each in found if each.complexity == fewest])
-
-
-def _most_likely(given: SearchInput, first: MeanSearch, found: list[SearchOutcome]) -> SearchOutcome:
-    """Return the most likely of equally simple explanations of the residuals, the first one if they cannot be compared.
-
-    Each is fitted anew with all its effects together. Where another one that differs in one effect is as likely, that effect
-    enters the class of the one in its place.
-    """
-    different = {frozenset(_names(each)): each for each in reversed(found)}.values()
-    fits = [fit for each in different if len(different) > 1 and (fit := _ExplanationFit.of(given, each)) is not None]
-    if len(fits) < 2:
-        return found[0]
-    common = np.all([each.used for each in fits], axis=0)
-    (highest, best), *others = sorted(((each.score(first, common), each.found) for each in fits), key=lambda item: -item[0])
-    for lower, other in others:
-        best = _with_alternative(best, other, highest - lower)
-    return best
-
-
-def _names(found: SearchOutcome) -> set[str]:
-    """Names of the effects of an explanation."""
-    return {each.candidate.name for each in found.estimates}
-
-
-def _with_alternative(best: SearchOutcome, other: SearchOutcome, lead: float) -> SearchOutcome:
-    """Add the effect in which another explanation differs to the class of the one in its place, if it is as likely.
-
-    lead: by how much the other one is less likely (penalised log-likelihood).
-    """
-    only_best, only_other = _names(best) - _names(other), _names(other) - _names(best)
-
-    def widened(estimate: Estimate) -> Estimate:
-        item = estimate.chosen
-        if estimate.candidate.name not in only_best or lead > equivalence_margin(item.log_likelihood_ratio):
-            return estimate
-        return replace(estimate, chosen=replace(item, indistinguishable=tuple(sorted(only_other | {*item.indistinguishable}))))
-
-    if len(only_best) != 1 or len(only_other) != 1:
-        return best
-    return replace(best, estimates=[widened(each) for each in best.estimates])
 
 
 def _registered_residuals(found: Residuals, part: Residuals) -> tuple[FloatArray, BoolArray]:

@@ -184,7 +184,8 @@ def _diagnose(measurement: Measurement, clock: _Clock, random: KeyedRandom) -> G
         return _insufficient_data(measurement, plain, surveyed, clock)
     validated = _select_and_validate(inputs, random)
     clock.lap("naming")
-    validated, validation, result, harmful = _with_gap(inputs, validated, random)
+    validation = _validation(inputs, validated, random)
+    result, harmful = validation.validate(validated.named)
     given, selection = validated.given, validated.selection
     notes = [
         *selection.notes,
@@ -243,28 +244,6 @@ def _aligned(measurement: Measurement) -> tuple[PassInputs, FloatArray]:
     return PassInputs(aligned, plain, held_out_points, blocks), pose
 
 
-def _with_gap(
-    inputs: PassInputs, validated: _ValidatedSelection, random: KeyedRandom
-) -> tuple[_ValidatedSelection, Validation, ValidationResult, list[str]]:
-    """Measure the gap without and with the effects of a selection.
-
-    If an empirical term does not close the gap, the selection is repeated without empirical terms.
-
-    Returns
-    -------
-    The selection that counts, the preparation of its scores, the scores, and notes on effects that widen the gap.
-    """
-    validation = _validation(inputs, validated, random)
-    result, harmful = validation.validate(validated.named)
-    if _has_alternatives(inputs, [item for item in validated.named if item not in result.named]):
-        again = _select_and_validate(inputs, random, frozenset({NONPARAMETRIC_TERMS}))
-        validation_again = _validation(inputs, again, random)
-        result_again, harmful_again = validation_again.validate(again.named)
-        if result_again.named:
-            return again, validation_again, result_again, [*harmful, *harmful_again]
-    return validated, validation, result, harmful
-
-
 def _evidence(validated: _ValidatedSelection, result: ValidationResult) -> Evidence:
     """Return the numbers that decide the verdict, but for the share of the wall that moved."""
     noise, tails = validated.selection.unexplained_noise, validated.tails
@@ -311,23 +290,11 @@ def _share_of_model_noise(share: float, residuals: Residuals) -> float:
 
 
 def _with_moved_share(evidence: Evidence, aligned: Measurement, given: PassInput, result: ValidationResult) -> Evidence:
-    """Add the share of the wall that moved, if that may be why nothing closes the gap, or why a noise term was named.
-
-    A noise term closes part of any gap, but it does not move neighbours together: beside a true noise next to nothing moved.
-    """
-    noisy = any(item.adds_variance for item in result.named)
-    still_unexplained = verdict_of(result.named, evidence) == "unknown" and (not result.named or evidence.closes_little)
-    if not (noisy or still_unexplained):
+    """Add the share of the wall that moved, if that may be why nothing closes the gap."""
+    if verdict_of(result.named, evidence) != "unknown" or (result.named and not evidence.closes_little):
         return evidence
     after = replace(given.residuals, value=result.value)
-    sight = SensorView.of(aligned, after)
-    moved = moved_share(after, sight, given.stable)
-    if noisy and not still_unexplained and moved >= thresholds().changes.moved_share:
-        found = compute_residuals(aligned.changed(model=result.model))
-        sigma = found.values_at(found.sigma, after.index)
-        beside = moved_share(replace(after, sigma=np.where(np.isfinite(sigma), sigma, after.sigma)), sight, given.stable)
-        moved = moved if beside >= thresholds().changes.moved_share else 0.0
-    return replace(evidence, moved_share=moved)
+    return replace(evidence, moved_share=moved_share(after, SensorView.of(aligned, after), given.stable))
 
 
 def _in_validation_epoch(epochs: NDArray[np.int64]) -> BoolArray:

@@ -15,7 +15,7 @@ of a point at infinity, and y is the tangent of a row's angle to the axis.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from scipy.optimize import minimize
@@ -77,15 +77,6 @@ class Locking:
     phase_rad: float
     tilt_rad: float
     gain: float
-
-    def with_variance(self, variance: float) -> Locking | None:
-        """Return the locking with an amplitude that also explains more variance of the residuals, if that is plausible.
-
-        variance: what the residuals vary beside the noise of the sensor model and this locking, px^2. None is returned if the
-        amplitude would be more than two standard deviations larger.
-        """
-        amplitude = float(np.sqrt(self.amplitude_px**2 + 2 * variance))
-        return replace(self, amplitude_px=amplitude) if amplitude < self.amplitude_px + 2 * self.std_px else None
 
 
 @dataclass(frozen=True)
