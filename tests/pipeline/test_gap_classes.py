@@ -104,16 +104,3 @@ def test_fewer_effects_are_no_alternative_if_they_leave_a_misfit_that_more_do_no
     monkeypatch.setattr(nonlinear_refit, "_within_bounds", lambda *_: True)
     nothing: Any = None
     assert nonlinear_refit._simpler(nothing, best, alone, ties=False) is (best if named == "a" else alone)
-
-
-def test_effects_of_an_explanation_keep_the_classes_of_the_linearised_search_unless_it_tells_them_apart() -> None:
-    """Beside y, effect x scores 199; a scores 5 less, which is within twice the margin of 3, and b scores 7 less."""
-    by = estimated("x").candidate
-    scores = tuple(FamilyScore(name, False, score, score, by, False) for name, score in (("a", 194.0), ("b", 192.0)))
-    linear = outcome([estimated("x", ("a", "b")), estimated("y")])
-    found = outcome([estimated("x", (), scores), estimated("y", ("c",))]).with_classes_of(linear)
-    assert [each.chosen.indistinguishable for each in found.estimates] == [("a",), ("c",)]
-    refitted = outcome([estimated("x", (), scores), estimated("y")], together=False).with_classes_of(linear)
-    assert refitted.estimates[0].chosen.indistinguishable == ("a", "b")
-    other = outcome([estimated("x"), estimated("z")])
-    assert other.with_classes_of(linear) is other

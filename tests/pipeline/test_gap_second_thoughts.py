@@ -7,7 +7,6 @@ reconsidered.
 from __future__ import annotations
 
 import json
-from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -25,7 +24,6 @@ from pipeline.gap.naming.gap_score import simulate_errors
 from pipeline.gap.naming.named_effects import NamedEffect, with_effects
 from pipeline.gap.naming.selection_notes import _note_most_similar
 from pipeline.gap.naming.selection_passes import PassInput, PassInputs, SelectionPass, select_beside_edge_effects
-from pipeline.gap.naming.validation import Validation, ValidationResult
 from pipeline.gap.naming.validation_scores import ValidatedEffects
 from pipeline.gap.noise_and_edges.edge_effects import EdgeEffect
 from pipeline.gap.noise_and_edges.variance_model import VarianceTerm
@@ -98,30 +96,6 @@ def test_where_a_free_form_fails_all_is_named_again_without_any(
     assert found.words == ["tls.range_empirical dropped: it does not improve the validation blocks"]
     assert seen == [False, True]
     assert found.selection.asked is bool(kept)  # type: ignore[attr-defined]
-
-
-def test_where_the_score_drops_an_empirical_term_all_is_named_again_without_any(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Ranges 8 mm too long by incidence, described first by an empirical term that predicts validation points worse."""
-    write_scan(tmp_path, 10, step_rad=0.007, ranges=lambda scan: scan.R + 0.008 * (1 / scan.cos_i - 1))
-    honest, score = workflow._select_and_validate, Validation.validate
-
-    def described(inputs: PassInputs, random: KeyedRandom, excluded: frozenset[Any] = frozenset()) -> Any:
-        found = honest(inputs, random, excluded)
-        return found if NONPARAMETRIC_TERMS in excluded else replace(found, named=[_named("range_empirical", "empirical")])
-
-    def scored(self: Validation, named: list[NamedEffect]) -> tuple[ValidationResult, list[str]]:
-        harmful = [f"{item.name} dropped: the model predicts worse with it" for item in named if item.kind == "empirical"]
-        return score(self, [item for item in named if item.kind != "empirical"])[0], harmful
-
-    monkeypatch.setattr(workflow, "_select_and_validate", described)
-    monkeypatch.setattr(Validation, "validate", scored)
-    found = workflow.diagnose(read_measurement(tmp_path))
-    (effect,) = found.effects
-    assert (found.verdict, effect.name) == ("named", "tls.range_incidence_bias")
-    assert effect.entry["coefficient_m"] == pytest.approx(0.008, abs=4 * effect.std["coefficient_m"])
-    assert "range_empirical dropped" in found.remaining["note"]
 
 
 def test_a_simulation_without_noise_departs_nowhere_from_the_surface(tmp_path: Path) -> None:

@@ -8,9 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from pipeline.gap.mean.selection import SelectedEffect
 from pipeline.gap.naming import workflow
-from pipeline.gap.naming.effect_selection import keep_implausible_in_class
 from pipeline.gap.naming.named_effects import NamedEffect
 from pipeline.gap.noise_and_edges.heavy_tails import find_heavy_tails
 from pipeline.gap.residuals.wall_blocks import BlockGrid
@@ -83,41 +81,3 @@ def test_what_far_points_gain_is_a_log_likelihood_and_not_their_number() -> None
 
     mixed = (1 - share) * density(cut, 1.0) + share * density(cut, wide)
     assert found.gain == pytest.approx(np.sum(np.log(mixed / density(cut, 1.0))), rel=1e-6)
-
-
-def test_an_effect_that_is_not_believed_stays_in_the_class_of_what_looks_like_it() -> None:
-    """A camera rotated by 23 times the typical size looks like a tangential distortion.
-
-    Whichever it is, neither is named alone.
-    """
-    turn: Any = SimpleNamespace(name="camera_omega", empirical=False)
-    chosen = SelectedEffect(turn, ("tangential_distortion",), 0.002, 70.0, 67.0, ())
-    named = [
-        NamedEffect(f"stereo.{name}", "physical", {"name": name}, {}, (), 0.002, 70.0)
-        for name in ("smoothing", "tangential_distortion")
-    ]
-    left_out = frozenset({("camera_omega", False)})
-    found = keep_implausible_in_class(named, [chosen], frozenset({"camera_omega"}), left_out)
-    assert [item.indistinguishable for item in found] == [(), ("stereo.camera_omega",)]
-    assert [
-        item.indistinguishable for item in keep_implausible_in_class(named, [chosen], frozenset({"camera_omega"}), frozenset())
-    ] == [
-        (),
-        (),
-    ]
-
-
-def test_what_is_named_in_the_place_of_an_effect_that_is_not_believed_shares_its_class() -> None:
-    """A tilt drift that only explains what an implausible vertical index leaves joins its class.
-
-    An offset that was there anyway does not.
-    """
-    index: Any = SimpleNamespace(name="vertical_index", empirical=False)
-    chosen = SelectedEffect(index, (), 0.002, 70.0, 67.0, ())
-    named = [
-        NamedEffect(f"tls.{name}", "physical", {"name": name}, {}, (), 0.002, 70.0) for name in ("tilt_drift", "range_offset")
-    ]
-    found = keep_implausible_in_class(
-        named, [chosen], frozenset({"vertical_index", "range_offset"}), frozenset({("vertical_index", False)})
-    )
-    assert [item.indistinguishable for item in found] == [("tls.vertical_index",), ()]

@@ -199,16 +199,14 @@ class MeanSearch:
     def with_harmonics(self, members: EffectSet, form: FamilyScore) -> FamilyScore:
         """Replace a non-parametric term that describes a periodic error by its best periodic form, to name the error's shape.
 
-        A wave gets overtones if they fit clearly better, because a periodic error need not be a sine. A spline becomes a wave
-        if that fits as well. Among patterns that repeat every few scan lines, columns or rows, the one with the fewest lines
-        is taken, because multiples of it fit as well. Other terms are returned unchanged.
+        A wave gets overtones if they fit clearly better, because a periodic error need not be a sine. Among patterns that
+        repeat every few scan lines, columns or rows, the one with the fewest lines is taken, because multiples of it fit as
+        well. Other terms are returned unchanged.
 
         members: the other errors in the model, fitted jointly. form: the term, such as a wave along a covariate, with its score.
         """
         if form.candidate.form.startswith(LINE_PATTERN):
             return self._of_fewest_lines(members, form)
-        if form.candidate.form == "spline":
-            form = self._wave_instead(members, form)
         return self._with_overtones(members, form) if form.candidate.form == "wave" else form
 
     def _of_fewest_lines(self, members: EffectSet, form: FamilyScore) -> FamilyScore:
@@ -218,18 +216,6 @@ class MeanSearch:
         return min(
             (each for each in alike if each.candidate.form.startswith(LINE_PATTERN)), key=lambda each: each.candidate.period
         )
-
-    def _wave_instead(self, members: EffectSet, form: FamilyScore) -> FamilyScore:
-        """Return the wave of the same covariate with refined period if it scores better than the spline `form`, else `form`."""
-        family = replace(form.candidate, form="wave").family
-        wave = next((each for each in self.score_families(members) if each.candidate.family == family), None)
-        if wave is None:
-            return form
-        others = [member.candidate for member in members]
-        (sine, *_), fit = self.design.fit_refined([wave.candidate, *others])
-        ratio = wave.log_likelihood_ratio + fit.log_likelihood - self.design.fit([wave.candidate, *others]).log_likelihood
-        score = ratio - (wave.log_likelihood_ratio - wave.score)
-        return replace(wave, candidate=sine, log_likelihood_ratio=ratio, score=score) if score > form.score else form
 
     def _with_overtones(self, members: EffectSet, form: FamilyScore) -> FamilyScore:
         """Return the wave `form` with its overtones if they improve the score clearly, else the wave itself."""

@@ -15,7 +15,6 @@ from typing import Protocol
 from pipeline.gap.mean.candidates import Candidate
 from pipeline.gap.mean.nonparametric_terms import POLYNOMIAL, SPATIAL_NULL
 from pipeline.gap.thresholds import equivalence_margin, thresholds
-from sensors.effects.range_offset import RangeOffset
 
 _BEAM_WIDTH = 5
 """Number of the best sets of one size that are grown further (beam width)."""
@@ -239,7 +238,7 @@ class ForwardSelection:
             terms = [(state, form) for state, *_ in levels if (form := state.nonparametric) is not None]
             found, term = terms[0]
             for state, form in terms[1:]:
-                if self._effects_required(state, state.score + form.score - found.score - term.score, term):
+                if self._significant(state.score + form.score - found.score - term.score):
                     found, term = state, form
             return found.members, term
         if not best.members or alone is None:
@@ -247,22 +246,6 @@ class ForwardSelection:
         score = max(best.score, self.search.joint_score(best.members))
         margin = max(thresholds().variance.least_gain, thresholds().mean.class_share * score) if len(best.members) < 2 else 0.0
         return ((), alone) if alone.score > score + margin else None
-
-    def _effects_required(self, state: _Set, score: float, form: FamilyScore) -> bool:
-        """Tell whether the data require the effects of a set beside a non-parametric term.
-
-        Such a term is inexact and has no constant. Each effect must therefore add more than a second term of the same
-        covariate, a polynomial of two covariates, or a constant would.
-        """
-        if not self._significant(score):
-            return False
-        own = form.name.split(" and ")
-        second = [
-            item.score
-            for item in self.search.score_families((form,))
-            if item.name == RangeOffset.tag() or item.candidate.form == POLYNOMIAL or (item.empirical and item.name in own)
-        ]
-        return score > len(state.members) * max([0.0, *second])
 
     def with_equivalents(self, among: EffectSet, item: FamilyScore, scores: SetScores) -> SelectedEffect:
         """Describe one effect of a selected set, with its p-value and the effects that cannot be distinguished from it.

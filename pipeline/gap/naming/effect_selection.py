@@ -15,7 +15,7 @@ from pipeline.gap.mean.candidates import Candidate, SineGrid
 from pipeline.gap.mean.detection_power import DetectableSize
 from pipeline.gap.mean.nonparametric_terms import SPATIAL_NULL
 from pipeline.gap.mean.search import MeanSearch
-from pipeline.gap.mean.selection import FamilyScore, SelectedEffect
+from pipeline.gap.mean.selection import FamilyScore
 from pipeline.gap.naming.candidate_families import candidate_families, model_has
 from pipeline.gap.naming.named_effects import (
     NamedEffect,
@@ -48,7 +48,6 @@ from pipeline.gap.residuals.wall_blocks import WallCells
 from scene.common.keyed_random import KeyedRandom
 from scene.geometry.mesh import FloatArray
 from sensors.effects.angle_empirical import AngleEmpirical
-from sensors.effects.base import ShowsIn
 from sensors.effects.pixel_locking import PixelLocking
 from sensors.effects.range_quantization import RangeQuantization
 from sensors.effects.regularization_noise import RegularizationNoise
@@ -177,9 +176,7 @@ def select_effects(given: SelectionInput) -> tuple[list[NamedEffect], SelectionR
         if refound is not None:
             return select_effects(replace(given, grid_noise=refound))
     if wrong := (wrong | noise.implausible(measurement)) - given.excluded:
-        again, result = select_effects(given.without(wrong))
-        before = frozenset(each.candidate.name for each in found.estimates)
-        return keep_implausible_in_class(again, found.chosen, before, wrong), result
+        return select_effects(given.without(wrong))
     systematic = [effect_from_estimate(each, found.residuals) for each in found.estimates]
     result = _result(given, search, first, found, noise, left, frozenset(item.name for item in systematic), apart.locking)
     angles = [each for each in systematic if each.effect is AngleEmpirical]
@@ -369,33 +366,6 @@ def _detectable_sizes(
     noise = detectable_noise(found.residuals, found.search.design.cells, left, noise_terms, random)
     tiles = [detectable_tile_shift(found.residuals, left)] if isinstance(found.residuals, StereoResiduals) else []
     return (*systematic, *tiles, *noise)
-
-
-def keep_implausible_in_class(
-    named: list[NamedEffect], chosen: list[SelectedEffect], before: frozenset[str], excluded: frozenset[tuple[str, bool]]
-) -> list[NamedEffect]:
-    """Report implausibly large effects as alternatives to the effects that a selection named in their place.
-
-    A first selection chose effects of implausible size, and was repeated without them. An implausible effect may still be the
-    true one. It is therefore added to the list `indistinguishable` of two kinds of effects: those that the first selection could
-    not tell from it, and those that only the repeated selection named.
-
-    Parameters
-    ----------
-    named : effects that the repeated selection named; they are returned with the alternatives added.
-    chosen : effects that the first selection chose; each lists the effects that it could not be told from.
-    before : names of the systematic effects of the first selection, without the sensor's prefix.
-    excluded : the implausible effects, as pairs (name, whether it is an empirical term).
-    """
-    implausible = [each for each in chosen if (each.candidate.name, False) in excluded]
-    found = []
-    for item in named:
-        sensor, name = item.name.split(".", 1)
-        instead = item.kind == "physical" and item.effect.shows_in == ShowsIn.MEAN and name not in before
-        alike = {f"{sensor}.{each.candidate.name}" for each in implausible if instead or name in each.indistinguishable}
-        further = sorted(alike - {item.name, *item.indistinguishable})
-        found.append(replace(item, indistinguishable=(*item.indistinguishable, *further)))
-    return found
 
 
 def _select_beside_tiles(given: SelectionInput, tiles: NamedEffect) -> tuple[list[NamedEffect], SelectionResult]:

@@ -132,13 +132,11 @@ def select_and_refit(given: SearchInput, first: MeanSearch) -> SearchOutcome:
         screened = _screened_single_fits(given, first, alone)
         if screened and (not alone or screened[0].estimate is not alone[0].estimate):
             beside_best = _search_beside_best(given, linear, screened) or beside_best
-        elif beside_best is not None:
-            beside_best = _with_class_of_first(beside_best, screened)
     if beside_best is not None and len(beside_best.estimates) == 1:
         return beside_best
     best = beside_best if beside_best is not None and _within_bounds(given, beside_best) else None
     best = _simpler(given, best, linear, ties=not alone)
-    return linear if best is None else best.with_classes_of(linear)
+    return linear if best is None else best
 
 
 def _simpler(given: SearchInput, best: SearchOutcome | None, other: SearchOutcome | None, ties: bool) -> SearchOutcome | None:
@@ -235,12 +233,6 @@ def _search_beside_best(given: SearchInput, plain: SearchOutcome, alone: list[_S
     """Repeat the search beside the best of some single fits."""
     estimate = _with_equivalence_class(alone).estimate
     return _search_beside(given, replace(plain, chosen=[estimate.chosen], estimates=[estimate]))
-
-
-def _with_class_of_first(found: SearchOutcome, fits: list[_SingleFit]) -> SearchOutcome:
-    """Return an explanation whose first effect is the best of some single fits, with its class among these."""
-    chosen, (first, *others) = _with_equivalence_class(fits).estimate.chosen, found.estimates
-    return replace(found, chosen=[chosen], estimates=[replace(first, chosen=chosen), *others])
 
 
 def _registered_residuals(found: Residuals, part: Residuals) -> tuple[FloatArray, BoolArray]:

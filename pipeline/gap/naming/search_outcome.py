@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
-
-import numpy as np
+from dataclasses import dataclass
 
 from pipeline.formats.measurements.measurement import Measurement
 from pipeline.gap.mean.candidates import Candidate, SineGrid
@@ -14,7 +12,7 @@ from pipeline.gap.mean.selection import FamilyScore, SelectedEffect
 from pipeline.gap.naming.named_effects import Estimate
 from pipeline.gap.noise_and_edges.variance_model import VarianceTerm
 from pipeline.gap.residuals.residuals import Residuals
-from pipeline.gap.thresholds import equivalence_margin, thresholds
+from pipeline.gap.thresholds import thresholds
 from scene.common.keyed_random import KeyedRandom
 
 
@@ -80,27 +78,3 @@ class SearchOutcome:
         """Tell whether this explanation leaves a misfit, so that it may lack an effect, where another one leaves none."""
         mine, theirs = (each.p_value is not None and each.p_value <= thresholds().verdict.rejection_p for each in (self, other))
         return mine and not theirs
-
-    def with_classes_of(self, linear: SearchOutcome) -> SearchOutcome:
-        """Add to the class of each effect what a linearised search could not tell from it, unless this explanation clearly can.
-
-        A class holds the effects that the measurement cannot tell apart. Either search has its own error, so an effect is left
-        out only if it scores worse here by twice the margin. Nothing is added unless both explain the residuals by the same
-        effects, two or more. Effects that were refitted one by one have no scores beside the others here, so all
-        that the linearised search could not tell from them is added.
-
-        linear: the explanation of the linearised search.
-        """
-        known = {each.candidate.name: set(each.indistinguishable) for each in linear.chosen}
-        if len(known) < 2 or known.keys() != {each.candidate.name for each in self.estimates}:
-            return self
-        together = len(self.chosen) == len(known)
-
-        def widened(estimate: Estimate) -> Estimate:
-            item = estimate.chosen
-            scores = {each.name: each.score for each in item.family_scores if together and not each.empirical}
-            least = item.score - 2 * equivalence_margin(item.log_likelihood_ratio)
-            near = {name for name in known[estimate.candidate.name] if scores.get(name, np.inf) > least}
-            return replace(estimate, chosen=replace(item, indistinguishable=tuple(sorted({*item.indistinguishable, *near}))))
-
-        return replace(self, estimates=[widened(each) for each in self.estimates])

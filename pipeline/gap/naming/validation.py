@@ -1,4 +1,4 @@
-"""Last step of the diagnosis: measure the gap with the named effects, and drop effects that make the predictions worse."""
+"""Last step of the diagnosis: measure the gap with the named effects."""
 
 from __future__ import annotations
 
@@ -13,7 +13,6 @@ from pipeline.gap.naming.named_effects import NamedEffect, aligned_with, with_ef
 from pipeline.gap.noise_and_edges.missing_returns import LossExplanation
 from pipeline.gap.residuals.alignment import fit_pose
 from pipeline.gap.residuals.residuals import BoolArray, Residuals
-from pipeline.gap.thresholds import thresholds
 from scene.common.keyed_random import KeyedRandom
 from scene.geometry.mesh import FloatArray
 from sensors.effects.base import ShowsIn
@@ -57,12 +56,6 @@ class ValidationResult:
         gap = self.gap
         return gap is not None and gap.measure != LOSS_MEASURE and gap.after > gap.before
 
-    @property
-    def is_clearly_worse(self) -> bool:
-        """Whether the model predicts validation points worse with the named effects by more than 2 standard errors (default)."""
-        sigmas, gap = thresholds().verdict.gap_sigmas, self.gap
-        return gap is not None and self.is_worse and gap.after - gap.before > sigmas * gap.error
-
 
 @dataclass(frozen=True)
 class Validation:
@@ -99,44 +92,15 @@ class Validation:
         """Pose that registers the measurement to the model without named effects, in the form of `RegisteredModel.pose`."""
         return fit_pose(self.residuals, self.registration_rows)
 
-    def validate(self, named: list[NamedEffect]) -> tuple[ValidationResult, list[str]]:
-        """Score the sensor model without and with the named effects on validation points, and drop effects that do harm.
+    def validate(self, named: list[NamedEffect]) -> ValidationResult:
+        """Score the sensor model without and with the named effects on validation points.
 
-        While the score is worse with the effects than without, effects are dropped one by one: each time the one that most
-        worsens the predictions of training points, if by more than the uncertainty. Two kinds of effects are dropped only if
-        the validation score is worse by more than its uncertainty: effects found in the distribution of the values (such as
-        rounding), and empirical terms that are no noise. Lower noise values are proposed only if they predict better.
+        Lower noise values are proposed only if the model predicts better with them.
 
         named: effects (sensor errors) that passed the selection.
-
-        Returns
-        -------
-        tuple : the result with the effects that are kept, and a note for each effect that was dropped.
         """
-        result, words = self._result_of(named), []
-        if self.reduced_noise and result.is_worse:
-            return replace(self, reduced_noise={}).validate(named)
-        while result.is_worse:
-            doubtful = [item for item in _without_losses(result.named) if result.is_clearly_worse or _may_be_dropped(item)]
-            harms = [self._harm(result, item) for item in doubtful]
-            if max(harms, default=0.0) <= 0:
-                break
-            out = doubtful[int(np.argmax(harms))]
-            words.append(f"{out.name} dropped: the model predicts worse with it")
-            result = self._result_of([item for item in result.named if item is not out])
-        return result, words
-
-    def _harm(self, result: ValidationResult, item: NamedEffect) -> float:
-        """By how much more than its uncertainty an effect worsens the predictions of the same training points.
-
-        The same points are compared, because an effect that moves some points far may bring others near.
-        """
-        others = [each for each in result.named if each is not item]
-        without = RegisteredModel(self._model(_without_losses(others)), self._registered(others)[1])
-        gap = self._gap(
-            result.named, (without, RegisteredModel(self._model(_without_losses(result.named)), result.pose)), self.training
-        )
-        return 0.0 if gap is None else gap.after - gap.before - thresholds().verdict.gap_sigmas * gap.error
+        result = self._result_of(named)
+        return replace(self, reduced_noise={}).validate(named) if self.reduced_noise and result.is_worse else result
 
     def _model(self, named: list[NamedEffect]) -> TlsModel | StereoModel:
         """The model with the effects and the reduced noise."""
@@ -180,11 +144,3 @@ class Validation:
 def _without_losses(named: list[NamedEffect]) -> list[NamedEffect]:
     """Return the effects without those that only remove or add returns, because these change no range on the wall."""
     return [item for item in named if item.effect.shows_in != ShowsIn.RETURNS]
-
-
-def _may_be_dropped(item: NamedEffect) -> bool:
-    """Whether an effect may be dropped although it harms the score only slightly.
-
-    An empirical term on the mean may not: it is inexact, but describes a misfit.
-    """
-    return item.adds_variance or (item.kind == "physical" and item.effect.shows_in != ShowsIn.VALUES)

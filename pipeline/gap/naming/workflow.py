@@ -185,19 +185,18 @@ def _diagnose(measurement: Measurement, clock: _Clock, random: KeyedRandom) -> G
     validated = _select_and_validate(inputs, random)
     clock.lap("naming")
     validation = _validation(inputs, validated, random)
-    result, harmful = validation.validate(validated.named)
+    result = validation.validate(validated.named)
     given, selection = validated.given, validated.selection
     notes = [
         *selection.notes,
         *note_excess_noise(selection.unexplained_noise.at_most_one, validation.reduced_noise),
         *validated.words,
-        *harmful,
     ]
     evidence = _evidence(validated, result)
     notes = [*notes, *note_overdispersion(evidence, notes)]
     evidence = _with_moved_share(evidence, aligned, given, result)
     if evidence.much_moved:
-        result, _ = replace(validation, reduced_noise={}).validate([])
+        result = replace(validation, reduced_noise={}).validate([])
         notes = [*note_moved_wall(evidence, bool(aligned.stable_areas)), *selection.notes]
     findings_first = sorted(notes, key=lambda note: note in plain.notes)  # then what the data cannot show
     value = plain.value - plain.pose_jacobian @ validation.pose
@@ -335,7 +334,7 @@ def _select_and_validate(
     lost = [effect_from_losses(losses[0], aligned.cloud.intensity)] if losses else []
     named = sorted([*best.named, *map(effect_from_edges, given.edge_effects), *lost], key=lambda item: -item.gain)
     named, words = only_within_bounds(aligned.model, named)
-    scored = _validate(aligned, given, named, selection.reference_sigma, inputs.blocks).with_needed(selection)
+    scored = _validate(aligned, given, named, selection.reference_sigma, inputs.blocks)
     words += [f"{item.name} dropped: it does not improve the validation blocks" for item in scored.failed]
     if NONPARAMETRIC_TERMS not in excluded and _has_alternatives(inputs, scored.failed):
         again = _select_and_validate(inputs, random, excluded | {NONPARAMETRIC_TERMS})
