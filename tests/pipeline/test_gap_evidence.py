@@ -293,7 +293,7 @@ def test_what_does_as_well_beside_the_other_camera_is_of_the_class() -> None:
     }
 
 
-@pytest.mark.parametrize(("places", "named"), [(5.0, {"collimation", "range_scale"}), (45.0, set())])
+@pytest.mark.parametrize(("places", "named"), [(5.0, {"collimation", "range_scale"}), (75.0, set())])
 def test_a_name_says_more_than_mere_places_do(places: float, named: set[str]) -> None:
     """One effect explains much, a second one something beside it; a step at a place along the wall always explains as much."""
 
