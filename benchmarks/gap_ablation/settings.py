@@ -17,7 +17,6 @@ OFF: dict[str, float] = {
     "mean.class_margin": 0.0,
     "mean.class_share": 0.0,
     "mean.most_effects": 9,
-    "mean.absorbed_share": 0.0,
     "mean.refit_share": 0.0,
     "mean.refit_gain": 0.0,
     "mean.most_reference_error": LARGE,

@@ -121,14 +121,6 @@ class MeanThresholds(ThresholdGroup):
         lt=1,
     )
     most_effects: PositiveInt = threshold_field(3, "effects", "At most this many systematic effects are selected.", JUDGEMENT)
-    absorbed_share: PositiveFloat = threshold_field(
-        0.1,
-        "share of the signature's sum of squares",
-        "If the registration leaves less than this of an effect's signature, it nearly absorbs the effect. The same share "
-        "decides whether a curve of an angle's error, stated in the model, makes the effect superfluous.",
-        JUDGEMENT,
-        lt=1,
-    )
     refit_share: PositiveFloat = threshold_field(
         0.5,
         "share of the largest log-likelihood ratio",
@@ -145,8 +137,7 @@ class MeanThresholds(ThresholdGroup):
     prior_size: PositiveFloat = threshold_field(
         20.0,
         "typical sizes of the effect",
-        "Standard deviation of the Gaussian prior of an effect's size. A larger effect that the registration nearly absorbs "
-        "(`mean.absorbed_share`) is accepted only if no misfit is left.",
+        "Standard deviation of the Gaussian prior of an effect's size.",
         JUDGEMENT,
     )
     most_reference_error: PositiveFloat = threshold_field(

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -14,8 +13,6 @@ from pipeline.formats.measurements.measurement import Measurement, read_measurem
 from pipeline.gap.mean.candidates import Candidate, SineGrid
 from pipeline.gap.naming import effect_selection, search_beside_effects
 from pipeline.gap.naming.candidate_families import candidate_families
-from pipeline.gap.naming.effect_screening import estimate_of_size
-from pipeline.gap.naming.search_outcome import SearchInput, SearchOutcome
 from pipeline.gap.residuals.alignment import align, fit_pose_robustly
 from pipeline.gap.residuals.residuals import Residuals
 from scene.common.keyed_random import KeyedRandom
@@ -65,21 +62,3 @@ def test_an_empirical_term_that_is_kept_counts_in_the_misfit_that_is_left(tmp_pa
     assert result.p_value_given(named) == result.p_value
     assert result.p_without_effects is not None
     assert result.p_without_effects <= 0.01
-
-
-def test_an_effect_that_a_curve_in_the_model_describes_can_be_known(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Such an effect is not among the families to try, but a search beside it must still find its signature."""
-    write_scan(tmp_path, 5, step_rad=0.009, ranges=_ranges)
-    there, residuals, _ = align(read_measurement(tmp_path))
-    part = residuals.part(residuals.usable)
-    families = _few(there, part)
-    (offset,) = (each for each in families if each.name == "range_offset" and isinstance(each, Candidate))
-    monkeypatch.setattr(
-        search_beside_effects, "candidate_families", lambda *given: [each for each in _few(*given) if each.name != "range_offset"]
-    )
-    given = SearchInput(there, part, families, lambda _: [], 0.0, KeyedRandom(1))
-    search: Any = SimpleNamespace(single_effect_ratios={})
-    before = SearchOutcome([], [], search, part, [], ())
-    again = search_beside_effects.repeat_search(given, before, [estimate_of_size(offset, np.array([0.002]))])
-    assert again is not None
-    assert again.estimates[0].candidate.name == "range_offset"

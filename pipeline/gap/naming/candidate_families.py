@@ -29,7 +29,6 @@ from pipeline.gap.residuals.tls_residuals import TlsResiduals
 from pipeline.gap.thresholds import thresholds
 from scene.geometry.mesh import FloatArray
 from sensors.effects import EFFECTS, effect_of
-from sensors.effects.angle_empirical import AngleEmpirical
 
 PERIODIC = {effect.tag(): effect.searched.along for effect in EFFECTS if effect.searched and effect.searched.along != "line"}
 """Sinusoidal effects and the covariate along which they repeat. A periodic error that is no sine belongs to none of them."""
@@ -83,8 +82,7 @@ def candidate_families(
         for form in nonparametric_terms(name, values, lowest.get(name, np.inf), _most_cycles(name, values))
     ]
     if isinstance(part, TlsResiduals):
-        angles = _angle_terms(part)
-        named, free = _without_described_by_curves(named, angles, measurement, part), [*free, *angles]
+        free += _angle_terms(part)
     first, second = part.position_covariates
     both = polynomial_term(first, second, part.covariates[first], part.covariates[second])
     return [*named, *free, *_half_pixel_sines(part), both, *_repeating_terms(part), *spatial_null_candidates(part.wall_xy)]
@@ -104,25 +102,6 @@ def _angle_terms(part: TlsResiduals) -> list[Candidate | SineGrid]:
     levers = {"azimuth": -part.geometry.by_azimuth, "zenith": -part.geometry.by_zenith}
     along = [(angle, name, values) for angle in levers for name, values in angles.items() if np.ptp(values) > 0]
     return [form for angle, name, values in along for form in angle_error_terms(angle, name, values, levers[angle])]
-
-
-def _without_described_by_curves(
-    named: list[Candidate | SineGrid], angles: list[Candidate | SineGrid], measurement: Measurement, part: TlsResiduals
-) -> list[Candidate | SineGrid]:
-    """Leave out effects that a curve of an angle's error, already in the model, describes too."""
-    curves = {(each.angle, each.covariate) for each in measurement.model.effects if isinstance(each, AngleEmpirical)}
-    held = [each.columns for each in angles if isinstance(each, Candidate) and (each.angle, each.name) in curves]
-    if not held:
-        return named
-    rows = slice(None, None, max(len(part) // _MOST_POINTS, 1))
-    basis = np.linalg.qr(np.concatenate([part.pose_jacobian[rows], *(columns[rows] for columns in held)], axis=1))[0]
-
-    def left(columns: FloatArray) -> float:
-        """Share of a signature's sum of squares that pose and curves leave."""
-        return float(np.sum((columns - basis @ (basis.T @ columns)) ** 2) / np.sum(columns**2))
-
-    least = thresholds().mean.absorbed_share
-    return [each for each in named if isinstance(each, SineGrid) or left(each.columns[rows]) > least]
 
 
 def _repeating_terms(part: Residuals) -> list[Candidate]:

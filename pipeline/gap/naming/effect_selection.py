@@ -25,7 +25,6 @@ from pipeline.gap.naming.named_effects import (
     effect_from_range_step,
     effect_from_seams,
     effect_from_variance,
-    merge_angle_curves,
     out_of_bounds,
     within_bounds,
 )
@@ -47,7 +46,6 @@ from pipeline.gap.residuals.tls_residuals import TlsResiduals
 from pipeline.gap.residuals.wall_blocks import WallCells
 from scene.common.keyed_random import KeyedRandom
 from scene.geometry.mesh import FloatArray
-from sensors.effects.angle_empirical import AngleEmpirical
 from sensors.effects.pixel_locking import PixelLocking
 from sensors.effects.range_quantization import RangeQuantization
 from sensors.effects.regularization_noise import RegularizationNoise
@@ -179,9 +177,6 @@ def select_effects(given: SelectionInput) -> tuple[list[NamedEffect], SelectionR
         return select_effects(given.without(wrong))
     systematic = [effect_from_estimate(each, found.residuals) for each in found.estimates]
     result = _result(given, search, first, found, noise, left, frozenset(item.name for item in systematic), apart.locking)
-    angles = [each for each in systematic if each.effect is AngleEmpirical]
-    if angles and not model_has(measurement, AngleEmpirical.tag()):
-        return _select_beside_angle_terms(given, angles, result)
     return [*apart.named, *systematic, *(effect_from_variance(each, part.sensor) for each in noise.terms)], result
 
 
@@ -370,37 +365,12 @@ def _detectable_sizes(
 
 def _select_beside_tiles(given: SelectionInput, tiles: NamedEffect) -> tuple[list[NamedEffect], SelectionResult]:
     """Select effects with the shifts of tiles in the model."""
-    named, result = select_effects(_beside(given, [tiles]))
+    aligned, found, _ = aligned_with(given.measurement, [tiles], given.part.index)
+    at = at_points_of(found, given.part)
+    ratio = fit_pose_robustly(at)[2]
+    named, result = select_effects(replace(given, measurement=aligned, part=at, noise_ratio=ratio, noise=None, grid_noise=None))
 
     def beside(kept: frozenset[str]) -> float | None:
         return result.p_value_given([each for each in named if each.name in kept]) if tiles.name in kept else None
 
     return [tiles, *named], replace(result, systematic=result.systematic | {tiles.name}, p_value_beside=beside)
-
-
-def _select_beside_angle_terms(
-    given: SelectionInput, angles: list[NamedEffect], first: SelectionResult
-) -> tuple[list[NamedEffect], SelectionResult]:
-    """Repeat the selection with curves of an angle's error in the model: the linear model is wrong for a ray that turns far.
-
-    What the second selection finds of the same form is added to the curves of the first.
-    """
-    named, result = select_effects(replace(_beside(given, angles), random=given.random.child("angles")))
-    joined, others = merge_angle_curves(angles, [item for item in named if item.effect is AngleEmpirical], given.part)
-    rest = [item for item in named if item.effect is not AngleEmpirical]
-    again = replace(
-        result,
-        tried=first.tried,
-        systematic=result.systematic | {item.name for item in angles},
-        p_without_effects=first.p_without_effects,
-        identifiability=first.identifiability,
-    )
-    return [*joined, *others, *rest], again
-
-
-def _beside(given: SelectionInput, named: list[NamedEffect]) -> SelectionInput:
-    """Input of a selection with some effects in the model."""
-    aligned, found, _ = aligned_with(given.measurement, named, given.part.index)
-    at = at_points_of(found, given.part)
-    ratio = fit_pose_robustly(at)[2]
-    return replace(given, measurement=aligned, part=at, noise_ratio=ratio, noise=None, grid_noise=None)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -34,11 +34,9 @@ from sensors.effects.pixel_locking import PixelLocking
 from sensors.effects.range_quantization import RangeQuantization
 from sensors.effects.tile_shift import TileShift
 from sensors.models.sensor_model import StereoModel, TlsModel
-from sensors.numerics.curve import Axis, interpolate_on_host
 
-_CURVE_NODES, _SURFACE_NODES, _SUM_NODES, _MOST_POINTS = 65, 17, 257, 20_000
-"""Nodes of the curve of an empirical term, of each side of a surface, and of a sum of curves; most points that a surface is
-fitted to."""
+_CURVE_NODES, _SURFACE_NODES, _MOST_POINTS = 65, 17, 20_000
+"""Nodes of the curve of an empirical term and of each side of a surface; most points that a surface is fitted to."""
 _STD_INFLATION = 1.1
 """Factor on all standard deviations, because the covariance of the reference error is itself estimated. Without it, 52 of 61
 intervals of 90 % contained the true value on the development cases."""
@@ -334,39 +332,6 @@ def _empirical_entry(candidate: Candidate, values: FloatArray, part: Residuals) 
         found = _surface_nodes(error, part) if candidate.form == POLYNOMIAL else _curve_nodes(candidate, error, part)
     rows = _rounded_rows(found.pop("values"))
     return {"name": name, **found, key: rows}
-
-
-def merge_angle_curves(
-    angles: list[NamedEffect], later: list[NamedEffect], part: Residuals
-) -> tuple[list[NamedEffect], list[NamedEffect]]:
-    """Add up error curves of a scanner's angle that two successive selections found, so that each is reported once.
-
-    A curve gives the error (rad) of an angle along a covariate. The second selection has the curves of the first one in its
-    model. What it finds for the same angle and covariate is therefore a correction of them. The first curves are returned with
-    their corrections added, and the later curves that belong to none of them.
-
-    Parameters
-    ----------
-    angles : curves of the first selection.
-    later : curves that the second selection found in addition.
-    part : residuals, with the covariates of their points, over whose range the curves are added.
-    """
-    joined, others = [], list(later)
-    for term in angles:
-        alike = [item for item in others if all(item.entry[key] == term.entry[key] for key in ("angle", "covariate"))]
-        others = [item for item in others if item not in alike]
-        joined.append(_sum_of_curves(term, alike, part) if alike else term)
-    return joined, others
-
-
-def _sum_of_curves(term: NamedEffect, later: list[NamedEffect], part: Residuals) -> NamedEffect:
-    """Return the sum of some curves over the whole range of their covariate."""
-    x = part.covariates[term.entry["covariate"]]
-    low, high = float(x.min()), float(x.max())
-    nodes = np.linspace(low, high, _SUM_NODES)
-    curves = ((Axis(**item.entry["along"]), item.entry["values_rad"]) for item in (term, *later))
-    total = sum(interpolate_on_host(nodes, nodes, along, Axis(), values) for along, values in curves)
-    return replace(term, entry={**term.entry, "along": {"low": low, "high": high}, "values_rad": _rounded_rows([total])})
 
 
 def _rounded_rows(values: Any) -> list[list[float]]:
