@@ -10,7 +10,7 @@ from pipeline.formats.measurements.measurement import Measurement
 from pipeline.gap.mean.candidates import Candidate
 from pipeline.gap.mean.search import MeanSearch
 from pipeline.gap.mean.selection import SelectedEffect
-from pipeline.gap.naming.candidate_families import catalogue_families
+from pipeline.gap.naming.candidate_families import candidate_families, catalogue_families
 from pipeline.gap.naming.effect_screening import gauss_newton_step, screen_effects
 from pipeline.gap.naming.named_effects import Estimate, out_of_bounds
 from pipeline.gap.naming.search_beside_effects import (
@@ -19,15 +19,18 @@ from pipeline.gap.naming.search_beside_effects import (
     recomputed,
     repeat_search,
     too_few_left,
+    with_variance_refitted,
 )
 from pipeline.gap.naming.search_outcome import SearchInput, SearchOutcome
+from pipeline.gap.naming.search_residuals import with_added_variance
 from pipeline.gap.residuals.alignment import at_points_of, fit_pose_robustly
 from pipeline.gap.residuals.residuals import BoolArray, Residuals
 from pipeline.gap.thresholds import equivalence_margin, thresholds
 from scene.geometry.mesh import FloatArray
 
-_MOST_CONVERGED, _MOST_ROUNDS, _CONVERGED_GAIN = 3, 8, 1.0
-"""Number of effects that are refitted to convergence, largest number of iterations, and gain of log-likelihood that ends them."""
+_MOST_CONVERGED, _MOST_ROUNDS, _CONVERGED_GAIN, _MOST_SELECTIONS = 3, 8, 1.0, 4
+"""Number of effects that are refitted to convergence, largest number of iterations, gain of log-likelihood that ends them, and
+most selections that are repeated with new slopes."""
 _ABSORBED_SHARE = 0.5
 """The linearised model is inexact if its error exceeds this share of the log-likelihood ratio of any selected effect."""
 
@@ -109,9 +112,9 @@ def select_and_refit(given: SearchInput, first: MeanSearch) -> SearchOutcome:
     """Select the systematic sensor errors (effects) that explain residuals, and refit the strong ones without linearising.
 
     The linearised model is inexact for a large effect, and forward selection then adds spurious effects that absorb the
-    linearisation error. Several explanations are therefore compared. One is the linearised selection. For another, the strongest
-    effects are refitted alone without linearising, and the selection is repeated beside the best one. If that still needs several
-    effects, or if none is strong, each effect is tried alone (`screen_effects`).
+    linearisation error. The strongest effects are therefore refitted alone without linearising, and the selection is repeated
+    beside the best one. If that still needs several effects, or if none is strong, each effect is tried alone
+    (`screen_effects`). If several are needed then too, the linearised selection is repeated with the slopes at its own effects.
 
     Parameters
     ----------
@@ -135,22 +138,56 @@ def select_and_refit(given: SearchInput, first: MeanSearch) -> SearchOutcome:
     if beside_best is not None and len(beside_best.estimates) == 1:
         return beside_best
     best = beside_best if beside_best is not None and _within_bounds(given, beside_best) else None
-    best = _simpler(given, best, linear, ties=not alone)
-    return linear if best is None else best
+    return _simpler(given, best, _with_new_slopes(given, linear)) or linear
 
 
-def _simpler(given: SearchInput, best: SearchOutcome | None, other: SearchOutcome | None, ties: bool) -> SearchOutcome | None:
+def _with_new_slopes(given: SearchInput, found: SearchOutcome) -> SearchOutcome:
+    """Repeat a selection with the slopes at the model that holds its effects, until it selects the same ones again.
+
+    This is the Gauss-Newton iteration, with the set of effects free as well as their sizes.
+    """
+    seen: list[set[str]] = []
+    while (names := {each.candidate.name for each in found.estimates}) not in seen and len(seen) < _MOST_SELECTIONS:
+        seen.append(names)
+        found = _selected_anew(given, found) or found
+    return found
+
+
+def _selected_anew(given: SearchInput, found: SearchOutcome) -> SearchOutcome | None:
+    """Select effects with the slopes at the model that holds the selected ones, what they explain being added to the residuals.
+
+    None if no effect of the catalogue was selected, if one is out of bounds, or if too few rays meet the reference.
+    """
+    known = [each for each in found.estimates if not each.candidate.empirical]
+    if not known or not _within_bounds(given, found):
+        return None
+    measurement, moved, _ = aligned_with_estimates(given, known)
+    at = with_added_variance(at_points_of(moved, given.part), given.added)
+    if too_few_left(given, at):
+        return None
+    catalogue = catalogue_families(measurement, at)
+    columns = (recomputed(each.candidate, catalogue).columns for each in known)
+    explained = sum(matrix @ each.values[: matrix.shape[1]] for matrix, each in zip(columns, known, strict=True))
+    allowed = {(family.name, family.empirical) for family in given.families}
+    families = [each for each in candidate_families(measurement, at, catalogue) if (each.name, each.empirical) in allowed]
+    left = replace(at, value=at.value + explained)
+    search = MeanSearch(replace(with_variance_refitted(given, at), value=left.value), families, given.random.child("again"))
+    together, tried = search.select()
+    return SearchOutcome(together, estimates_of(search, together), search, left, together, tried)
+
+
+def _simpler(given: SearchInput, best: SearchOutcome | None, other: SearchOutcome) -> SearchOutcome | None:
     """Return the simpler of two explanations of the residuals, after a search for effects that the second one may lack.
 
     That search only adds effects, so it is left out where the second explanation cannot be simpler. One that still leaves a
-    misfit, where the first leaves none, is no alternative.
-    best: the first explanation; None if there is none. ties: whether the second one is returned if both are equally simple.
+    misfit, where the first leaves none, is no alternative. best: the first explanation, which is returned if it is simpler; None
+    if there is none.
     """
-    if other is None or not other.chosen:
+    if not other.chosen:
         return best
 
     def wins(complexity: tuple[int, int]) -> bool:
-        return best is None or complexity < best.complexity or (ties and complexity == best.complexity)
+        return best is None or complexity <= best.complexity
 
     if not wins((0, sum(not each.candidate.empirical for each in other.estimates))):
         return best
