@@ -103,4 +103,4 @@ def test_fewer_effects_are_no_alternative_if_they_leave_a_misfit_that_more_do_no
     monkeypatch.setattr(nonlinear_refit, "_search_beside", lambda *_: alone)
     monkeypatch.setattr(nonlinear_refit, "_within_bounds", lambda *_: True)
     nothing: Any = None
-    assert nonlinear_refit._simpler(nothing, best, alone) is (best if named == "a" else alone)
+    assert nonlinear_refit._simpler(nothing, best, alone, ties=False) is (best if named == "a" else alone)

@@ -199,25 +199,42 @@ def _explanation(physical: int, empirical: int) -> Any:
     )
 
 
+def test_two_large_effects_are_found_with_the_slopes_at_the_fitted_model(
+    turned_and_zoomed: tuple[SearchInput, dict[str, dict[str, Any]]],
+) -> None:
+    """With the slopes at the model without effects, other effects are found instead, or more than two."""
+    points, truth = turned_and_zoomed
+    first = MeanSearch(with_fitted_variance(points.part, [], 1.0), points.families, KeyedRandom(1))
+    assert {each.candidate.name for each in first.select()[0]} != set(truth)
+    found = select_and_refit(points, first)
+    assert {each.candidate.name for each in found.estimates} == set(truth)
+
+
 @pytest.mark.parametrize(
-    ("best", "other", "searched", "other_wins"),
+    ("best", "other", "ties", "searched", "other_wins"),
     [
-        ((2, 0), (1, 1), True, False),  # its empirical term might have gone
-        ((2, 0), (2, 0), True, True),
-        ((2, 0), (3, 0), False, False),
-        ((1, 1), (2, 0), True, True),
-        (None, (3, 1), True, True),
+        ((2, 0), (1, 1), False, True, False),  # its empirical term might have gone
+        ((2, 0), (2, 0), False, False, False),
+        ((2, 0), (2, 0), True, True, True),
+        ((2, 0), (3, 0), True, False, False),
+        ((1, 1), (2, 0), False, True, True),
+        (None, (3, 1), False, True, True),
     ],
 )
 def test_no_effects_are_searched_beside_an_explanation_that_cannot_be_simpler(
-    best: tuple[int, int] | None, other: tuple[int, int], searched: bool, other_wins: bool, monkeypatch: pytest.MonkeyPatch
+    best: tuple[int, int] | None,
+    other: tuple[int, int],
+    ties: bool,
+    searched: bool,
+    other_wins: bool,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """Each explanation is given by two numbers: of its effects of the catalogue, and of its empirical terms."""
     tried: list[Any] = []
     monkeypatch.setattr(nonlinear_refit, "_search_beside", lambda _, outcome: tried.append(outcome))
     monkeypatch.setattr(nonlinear_refit, "_within_bounds", lambda *_: True)
     known, second, nothing = None if best is None else _explanation(*best), _explanation(*other), cast(Any, None)
-    assert nonlinear_refit._simpler(nothing, known, second) is (second if other_wins else known)
+    assert nonlinear_refit._simpler(nothing, known, second, ties) is (second if other_wins else known)
     assert tried == [second] * searched
 
 

@@ -138,7 +138,10 @@ def select_and_refit(given: SearchInput, first: MeanSearch) -> SearchOutcome:
     if beside_best is not None and len(beside_best.estimates) == 1:
         return beside_best
     best = beside_best if beside_best is not None and _within_bounds(given, beside_best) else None
-    return _simpler(given, best, _with_new_slopes(given, linear)) or linear
+    best = _simpler(given, best, linear, ties=not alone)
+    if best is None or best.complexity > (0, 1):
+        best = _simpler(given, best, _with_new_slopes(given, linear), ties=True)
+    return linear if best is None else best
 
 
 def _with_new_slopes(given: SearchInput, found: SearchOutcome) -> SearchOutcome:
@@ -176,18 +179,18 @@ def _selected_anew(given: SearchInput, found: SearchOutcome) -> SearchOutcome | 
     return SearchOutcome(together, estimates_of(search, together), search, left, together, tried)
 
 
-def _simpler(given: SearchInput, best: SearchOutcome | None, other: SearchOutcome) -> SearchOutcome | None:
+def _simpler(given: SearchInput, best: SearchOutcome | None, other: SearchOutcome, ties: bool) -> SearchOutcome | None:
     """Return the simpler of two explanations of the residuals, after a search for effects that the second one may lack.
 
     That search only adds effects, so it is left out where the second explanation cannot be simpler. One that still leaves a
-    misfit, where the first leaves none, is no alternative. best: the first explanation, which is returned if it is simpler; None
-    if there is none.
+    misfit, where the first leaves none, is no alternative.
+    best: the first explanation; None if there is none. ties: whether the second one is returned if both are equally simple.
     """
     if not other.chosen:
         return best
 
     def wins(complexity: tuple[int, int]) -> bool:
-        return best is None or complexity <= best.complexity
+        return best is None or complexity < best.complexity or (ties and complexity == best.complexity)
 
     if not wins((0, sum(not each.candidate.empirical for each in other.estimates))):
         return best
