@@ -18,7 +18,7 @@ from gap_cases import write_scan
 from benchmarks.gap_closed_form.cases import Case, make
 from pipeline.formats.measurements.measurement import StereoMeasurement, read_measurement
 from pipeline.gap.mean.nonparametric_terms import SPATIAL_NULL
-from pipeline.gap.naming import workflow
+from pipeline.gap.naming import selection_passes, workflow
 from pipeline.gap.naming.effect_selection import NONPARAMETRIC_TERMS
 from pipeline.gap.naming.gap_score import simulate_errors
 from pipeline.gap.naming.named_effects import NamedEffect, with_effects
@@ -237,3 +237,15 @@ def test_what_shapes_do_is_found_once_for_a_search(tmp_path: Path) -> None:
     assert np.std(part.shaped_px) > 0.01, "px that the low-pass does"
     moved = compute_residuals(part.changed(shaped_px=part.shaped_px + 1))
     np.testing.assert_allclose(moved.value, found - 1)
+
+
+@pytest.mark.parametrize(("beside", "kept"), [(["smoothing", "edge_fattening"], True), (["edge_fattening"], False), ([], False)])
+def test_smoothing_must_also_show_beside_the_effect_that_makes_residuals_smallest(
+    monkeypatch: pytest.MonkeyPatch, beside: list[str], kept: bool
+) -> None:
+    """A small error of the rays' directions looks like smoothing."""
+    first, then = ([SimpleNamespace(name=name) for name in names] for names in (["smoothing"], beside))
+    monkeypatch.setattr(selection_passes, "_find_edge_effects", lambda *_: first)
+    inputs: Any = SimpleNamespace(large_effect=None, _best_single_effect="camera_phi", measurement=None, plain=None)
+    inputs.held_out_points, inputs._edge_effects_beside = None, lambda effects, _: then if effects == ["camera_phi"] else []
+    assert PassInputs.edge_effects.func(inputs) is (first if kept else then)

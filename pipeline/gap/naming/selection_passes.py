@@ -245,10 +245,18 @@ class PassInputs:
 
     @cached_property
     def edge_effects(self) -> list[EdgeEffect]:
-        """The effects at depth steps (edge effects) that the residuals show beside a large effect, if there is one."""
+        """The effects at depth steps (edge effects) that the residuals show beside a large effect, if there is one.
+
+        A small error of the rays' directions looks like smoothing. Smoothing must therefore also show beside the effect that
+        alone makes the residuals smallest.
+        """
         if self.large_effect is not None:
             return self._edge_effects_beside([self.large_effect], [])
-        return _find_edge_effects(self.measurement, self.plain, self.held_out_points)
+        found = _find_edge_effects(self.measurement, self.plain, self.held_out_points)
+        if Smoothing.tag() in _names(found) and self._best_single_effect is not None:
+            beside = self._edge_effects_beside([self._best_single_effect], [])
+            return found if Smoothing.tag() in _names(beside) else beside
+        return found
 
     def edge_effects_given(self, found: SelectionPass) -> list[EdgeEffect]:
         """Search effects at depth steps (edge effects) again, with other errors in the model that can hide or imitate them.
