@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any, ClassVar
 
 import numpy as np
@@ -22,6 +23,7 @@ from pipeline.gap.mean.selection import EffectSet, FamilyScore, ForwardSelection
 from pipeline.gap.naming.named_effects import NamedEffect
 from pipeline.gap.naming.selection_passes import subsample
 from pipeline.gap.naming.validation_scores import (
+    ValidatedEffects,
     _log_score_gains,
     _RegisteredResiduals,
     blocks_agree,
@@ -310,3 +312,35 @@ def test_effects_that_leave_no_point_to_score_gain_nothing() -> None:
     with_all = _RegisteredResiduals(np.full(count, np.nan), np.ones(count), NO_CORRELATED_NOISE)
     place, block = np.zeros((count, 2)), np.zeros(count, dtype=np.int64)
     assert not len(_log_score_gains(with_all, with_all, np.isfinite(with_all.value), place, block, 0.0))
+
+
+@pytest.mark.parametrize(
+    ("with_it", "without", "systematic", "stays"),
+    [
+        (0.2, 0.002, True, True),
+        (0.008, 0.002, True, False),
+        (0.2, 0.02, True, False),
+        (None, 0.002, True, False),
+        (0.2, 0.002, False, False),
+    ],
+)
+def test_a_weak_effect_is_named_if_a_misfit_is_left_only_without_it(
+    with_it: float | None, without: float, systematic: bool, stays: bool
+) -> None:
+    """The p-values are those of the misfit with and without the weak effect. A noise effect cannot explain a misfit of means."""
+    strong, weak = (NamedEffect(f"tls.{name}", "physical", {"name": name}, {}, (), 0.002, 9.0) for name in ("a", "b"))
+    names = frozenset({"tls.a", "tls.b"} if systematic else {"tls.a"})
+    selection: Any = SimpleNamespace(systematic=names, p_value_given=lambda named: with_it if weak in named else without)
+    found = ValidatedEffects([strong], [], [weak]).with_needed(selection)
+    assert found == (ValidatedEffects([strong, weak], [], []) if stays else ValidatedEffects([strong], [], [weak]))
+
+
+def test_a_weak_curve_is_not_named_although_it_explains_a_misfit() -> None:
+    """A curve names no cause, and may describe no more than what is inexact in the form of the strong effect."""
+    strong = NamedEffect("tls.a", "physical", {"name": "a"}, {}, (), 0.002, 9.0)
+    curve = replace(strong, name="tls.b", kind="empirical")
+    selection: Any = SimpleNamespace(
+        systematic=frozenset({"tls.a", "tls.b"}), p_value_given=lambda named: 0.2 if curve in named else 0.002
+    )
+    found = ValidatedEffects([strong], [], [curve])
+    assert found.with_needed(selection) == found

@@ -14,6 +14,7 @@ from scipy.sparse import csr_array
 
 from pipeline.change.robust import nmad
 from pipeline.formats.measurements.measurement import Measurement
+from pipeline.gap.naming.effect_selection import SelectionResult
 from pipeline.gap.naming.named_effects import NamedEffect, aligned_with
 from pipeline.gap.noise_and_edges.sign_flips import DRAWS
 from pipeline.gap.residuals.alignment import fit_pose
@@ -48,6 +49,23 @@ class ValidatedEffects:
     named: list[NamedEffect]
     failed: list[NamedEffect]
     weak: list[NamedEffect]
+
+    def with_needed(self, selection: SelectionResult) -> ValidatedEffects:
+        """Return the same effects, with the weak systematic ones of the catalogue named if only they explain a misfit.
+
+        Without them the residuals must clearly disagree with the model (`verdict.rejection_p`), and with them no longer.
+
+        selection: the selection that found the effects.
+        """
+        needed = [item for item in self.weak if item.name in selection.systematic and item.kind == "physical"]
+        if not needed:
+            return self
+        with_them = [*self.named, *needed]
+        before, after = selection.p_value_given(self.named), selection.p_value_given(with_them)
+        if before is None or after is None or not before <= thresholds().verdict.rejection_p < after:
+            return self
+        named = sorted(with_them, key=lambda item: -item.gain)
+        return ValidatedEffects(named, self.failed, [item for item in self.weak if item not in needed])
 
 
 def validate_effects(

@@ -334,7 +334,7 @@ def _select_and_validate(
     lost = [effect_from_losses(losses[0], aligned.cloud.intensity)] if losses else []
     named = sorted([*best.named, *map(effect_from_edges, given.edge_effects), *lost], key=lambda item: -item.gain)
     named, words = only_within_bounds(aligned.model, named)
-    scored = _validate(aligned, given, named, selection.reference_sigma, inputs.blocks)
+    scored = _validate(aligned, given, named, selection.reference_sigma, inputs.blocks).with_needed(selection)
     words += [f"{item.name} dropped: it does not improve the validation blocks" for item in scored.failed]
     if NONPARAMETRIC_TERMS not in excluded and _has_alternatives(inputs, scored.failed):
         again = _select_and_validate(inputs, random, excluded | {NONPARAMETRIC_TERMS})
