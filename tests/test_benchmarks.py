@@ -34,6 +34,7 @@ ELSEWHERE = {
     "bad_inputs/preloaded": "benchmarks/bad_inputs/run.py runs it as a process of its own",
     "gap_ablation/run": "tests/test_gap_ablation.py",
     "gap_ablation/page": "tests/test_gap_ablation.py",
+    "gap_ablation/steps": "tests/test_gap_ablation.py",
     "gap_closed_form/run": "tests/test_gap_closed_form.py",
     "gap_monitored": "tests/monitor/test_stable_measurement.py runs the same commands on smaller walls",
     "gap_injections/run": "tests/test_gap_injections.py",

@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from benchmarks.gap_ablation import page, run
+from benchmarks.gap_ablation import page, run, steps
 from benchmarks.gap_ablation.settings import KEPT_OUT, MERGED, OFF, changed, others
 from benchmarks.gap_ablation.sources import StoredCase, stored_cases
 from pipeline.gap.thresholds import Thresholds
@@ -73,3 +73,29 @@ def test_a_case_is_diagnosed_again_only_where_a_decision_would_differ(
     written = page.page(json.loads(json.dumps(results)), "make")
     assert "| `variance.least_gain` | 6 | none | 1 | 1 | 1 | 1 | 1 | 0 | kept |" in written
     assert "| `variance.least_gain` | off | second 0001 | right to false alarm |" in written
+
+
+def test_each_step_of_the_diagnosis_has_a_replacement_of_its_kind() -> None:
+    for owner, name, nothing in steps.STEPS.values():
+        assert callable(getattr(owner, name)) == callable(nothing), name
+
+
+def test_answers_that_change_without_a_step_are_printed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for name in ("0001", "0002"):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "measurement.yaml").touch()
+    asked: list[tuple[str, list[str] | None]] = []
+
+    def answer(folder: Path, off: list[str] | None = None) -> str:
+        asked.append((folder.name, off))
+        return "unknown: nothing named" if off == ["heavy tails"] and folder.name == "0002" else "no_gap: nothing named"
+
+    monkeypatch.setattr(steps, "answer", answer)
+    monkeypatch.setattr("sys.argv", ["steps", str(tmp_path), "--step", "heavy tails", "--step", "overtones of a wave"])
+    steps.main()
+    assert asked == [(name, off) for name in ("0001", "0002") for off in (None, ["heavy tails"], ["overtones of a wave"])]
+    assert [line for line in capsys.readouterr().out.splitlines() if line.startswith(" ")] == [
+        "  without heavy tails: unknown: nothing named"
+    ]

@@ -54,6 +54,7 @@ DONE: dict[str, str] = {
     "mean.null_wave_ratio": "deleted; `variance.least_gain` decides",
     "mean.most_effects": "kept: with 9 a right answer becomes wrong",
     "mean.least_nonparametric_score": "now twice `variance.least_gain`, which is the same value",
+    "mean.absorbed_share": "deleted: no stored case came to it",
     "mean.absorbed_size": "merged with `mean.prior_size`",
     "mean.least_relative_gain": "merged with `mean.class_share`",
     "mean.least_wave_sigmas": "deleted",

@@ -1,0 +1,82 @@
+"""Switch off single steps of `gap`, one at a time, and print the answers that change.
+
+    python benchmarks/gap_ablation/steps.py FOLDER [FOLDER ...] [--step NAME ...]
+
+A FOLDER is a measurement or holds measurements. Each is diagnosed with all steps, and once without each step that is named
+(default: every step of `STEPS`). An answer is the verdict with the named effects, each with those that it cannot be told from.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Iterator
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Any
+from unittest.mock import patch
+
+from pipeline.formats.measurements.measurement import FILE, read_measurement
+from pipeline.gap.mean.search import MeanSearch
+from pipeline.gap.naming import effect_selection, nonlinear_refit, validation_scores, workflow
+from pipeline.gap.naming.selection_passes import PassInputs, SelectionPass
+from pipeline.gap.naming.validation_scores import ValidatedEffects
+from pipeline.gap.noise_and_edges import disparity_edges, variance_model
+
+
+def _first_pass(inputs: PassInputs, random: Any, excluded: Any) -> SelectionPass:
+    """Select effects without searching edge effects again."""
+    return SelectionPass.of(inputs.with_these(inputs.edge_effects), random, excluded)
+
+
+STEPS: dict[str, tuple[Any, str, Any]] = {
+    "each effect is tried alone": (nonlinear_refit, "_screened_single_fits", lambda given, first, alone: alone),
+    "selection with new slopes": (nonlinear_refit, "_with_new_slopes", lambda given, found: found),
+    "pose beside edge fattening": (workflow, "align_beside_fattening", lambda pair, initial, found, trusted: found),
+    "windows of edge fattening": (disparity_edges, "_WINDOWS", ()),
+    "edge effects searched again": (workflow, "select_beside_edge_effects", _first_pass),
+    "tiles with unequal shifts": (effect_selection, "_unequal_tiles", lambda *_: None),
+    "overtones of a wave": (MeanSearch, "_with_overtones", lambda search, members, form: form),
+    "groups of effects validated": (validation_scores, "_groups", lambda effects: []),
+    "weak effects left out": (validation_scores, "_is_weak", lambda item, gains, most: False),
+    "weak effects named again": (ValidatedEffects, "with_needed", lambda found, selection: found),
+    "best single effect": (PassInputs, "_best_single_effect", property(lambda inputs: None)),
+    "variance that neighbours share": (variance_model, "_unshared_share", lambda *_: 1.0),
+    "heavy tails": (workflow, "_with_heavy_tails", lambda measurement, named, blocks: (named, None)),
+    "selection without empirical terms": (workflow, "_has_alternatives", lambda inputs, dropped: False),
+}
+"""What replaces each step: the module or class that holds it, its name there, and a replacement that does nothing."""
+
+
+def answer(folder: Path, steps: list[str] | None = None) -> str:
+    """Return verdict and named effects of a measurement. steps: names of the steps to switch off."""
+    with ExitStack() as off:
+        for owner, name, nothing in (STEPS[step] for step in steps or []):
+            off.enter_context(patch.object(owner, name, nothing))
+        found = workflow.diagnose(read_measurement(folder))
+    named = (f"{item.name} {{{', '.join(item.indistinguishable)}}}" for item in found.effects)
+    return f"{found.verdict}: {', '.join(named) or 'nothing named'}"
+
+
+def measurements(folders: list[Path]) -> Iterator[Path]:
+    """Folders of measurements, in the order of their names."""
+    for folder in folders:
+        yield from [folder] if (folder / FILE).exists() else sorted(each.parent for each in folder.glob(f"*/{FILE}"))
+
+
+def main() -> None:
+    """Print the answers that change without a step."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("folders", nargs="+", type=Path, metavar="FOLDER", help="a measurement, or a folder of measurements")
+    parser.add_argument("--step", action="append", choices=list(STEPS), help="switch off only this step; may be repeated")
+    given = parser.parse_args()
+    for folder in measurements(given.folders):
+        usual = answer(folder)
+        print(f"{folder}: {usual}", flush=True)
+        for step in given.step or STEPS:
+            without = answer(folder, [step])
+            if without != usual:
+                print(f"  without {step}: {without}", flush=True)
+
+
+if __name__ == "__main__":
+    main()
