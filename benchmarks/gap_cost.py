@@ -45,7 +45,7 @@ PARTS: dict[str, list[tuple[Any, str]]] = {
     ],
     "search: design and null": [(MeanSearch, "__init__")],
     "search: selection": [(MeanSearch, "select")],
-    "refits": [(nonlinear_refit, name) for name in ("_strongest_single_fits", "_screened_single_fits", "_with_new_slopes")],
+    "refits": [(nonlinear_refit, name) for name in ("_strongest_single_fits", "_screened_single_fits", "_relinearised")],
     "noise": [(effect_selection, name) for name in ("fit_variance_model", "separate_white_and_grid_noise", "find_grid_noise")],
     "detectable sizes": [(effect_selection, "_detectable_sizes")],
     "validation of effects": [(workflow, "validate_effects")],

@@ -30,7 +30,7 @@ def _first_pass(inputs: PassInputs, random: Any, excluded: Any) -> SelectionPass
 
 STEPS: dict[str, tuple[Any, str, Any]] = {
     "each effect is tried alone": (nonlinear_refit, "_screened_single_fits", lambda given, first, alone: alone),
-    "selection with new slopes": (nonlinear_refit, "_with_new_slopes", lambda given, found: found),
+    "relinearised selection": (nonlinear_refit, "_relinearised", lambda given, found: found),
     "pose beside edge fattening": (workflow, "align_beside_fattening", lambda pair, initial, found, trusted: found),
     "windows of edge fattening": (disparity_edges, "_WINDOWS", ()),
     "edge effects searched again": (workflow, "select_beside_edge_effects", _first_pass),

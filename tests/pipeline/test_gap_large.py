@@ -185,7 +185,7 @@ def test_effects_are_tried_one_by_one_where_several_weak_ones_seem_needed(
 
     monkeypatch.setattr(nonlinear_refit, "_search_beside_best", beside_best)
     monkeypatch.setattr(nonlinear_refit, "_search_beside", lambda *_: None)
-    monkeypatch.setattr(nonlinear_refit, "_with_new_slopes", lambda _, linear: replace(linear, chosen=[]))
+    monkeypatch.setattr(nonlinear_refit, "_relinearised", lambda _, linear: replace(linear, chosen=[]))
     for fewer in (0, 1):
         found = select_and_refit(points, first)
         assert (found is tried[-1]) == (fewer > 0)
@@ -200,10 +200,10 @@ def _explanation(physical: int, empirical: int) -> Any:
     )
 
 
-def test_two_large_effects_are_found_with_the_slopes_at_the_fitted_model(
+def test_two_large_effects_are_found_with_the_derivatives_at_the_fitted_model(
     turned_and_zoomed: tuple[SearchInput, dict[str, dict[str, Any]]],
 ) -> None:
-    """With the slopes at the model without effects, a third one is found beside them."""
+    """With the derivatives at the model without effects, a third effect is selected beside the two."""
     points, _ = turned_and_zoomed
     first = MeanSearch(with_fitted_variance(points.part, [], 1.0), points.families, KeyedRandom(1))
     assert len(first.select()[0]) > 2

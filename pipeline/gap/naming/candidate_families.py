@@ -34,8 +34,6 @@ PERIODIC = {effect.tag(): effect.searched.along for effect in EFFECTS if effect.
 """Sinusoidal effects and the covariate along which they repeat. A periodic error that is no sine belongs to none of them."""
 _IMAGE = ("image_x", "image_y")
 _NO_NONPARAMETRIC_TERM = ("edge_step", "line", "disparity_fraction")
-_MOST_POINTS = 5_000
-"""Number of points on which signatures are compared with the curves that the model already contains."""
 
 
 def model_has(measurement: Measurement, name: str) -> bool:

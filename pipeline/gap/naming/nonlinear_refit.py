@@ -30,7 +30,7 @@ from scene.geometry.mesh import FloatArray
 
 _MOST_CONVERGED, _MOST_ROUNDS, _CONVERGED_GAIN, _MOST_SELECTIONS = 3, 8, 1.0, 4
 """Number of effects that are refitted to convergence, largest number of iterations, gain of log-likelihood that ends them, and
-most selections that are repeated with new slopes."""
+most selections that are repeated with new derivatives."""
 _ABSORBED_SHARE = 0.5
 """The linearised model is inexact if its error exceeds this share of the log-likelihood ratio of any selected effect."""
 
@@ -114,7 +114,8 @@ def select_and_refit(given: SearchInput, first: MeanSearch) -> SearchOutcome:
     The linearised model is inexact for a large effect, and forward selection then adds spurious effects that absorb the
     linearisation error. The strongest effects are therefore refitted alone without linearising, and the selection is repeated
     beside the best one. If that still needs several effects, or if none is strong, each effect is tried alone
-    (`screen_effects`). If several are needed then too, the linearised selection is repeated with the slopes at its own effects.
+    (`screen_effects`). If several are needed then too, the selection is relinearised: repeated with
+    the derivatives at the model that holds its effects.
 
     Parameters
     ----------
@@ -140,24 +141,26 @@ def select_and_refit(given: SearchInput, first: MeanSearch) -> SearchOutcome:
     best = beside_best if beside_best is not None and _within_bounds(given, beside_best) else None
     best = _simpler(given, best, linear, ties=not alone)
     if best is None or best.complexity > (0, 1):
-        best = _simpler(given, best, _with_new_slopes(given, linear), ties=True)
+        best = _simpler(given, best, _relinearised(given, linear), ties=True)
     return linear if best is None else best
 
 
-def _with_new_slopes(given: SearchInput, found: SearchOutcome) -> SearchOutcome:
-    """Repeat a selection with the slopes at the model that holds its effects, until it selects the same ones again.
+def _relinearised(given: SearchInput, found: SearchOutcome) -> SearchOutcome:
+    """Repeat a selection with derivatives taken at the model that holds its effects, until it selects the same ones again.
 
     This is the Gauss-Newton iteration, with the set of effects free as well as their sizes.
     """
     seen: list[set[str]] = []
     while (names := {each.candidate.name for each in found.estimates}) not in seen and len(seen) < _MOST_SELECTIONS:
         seen.append(names)
-        found = _selected_anew(given, found) or found
+        found = _selected_at_fit(given, found) or found
     return found
 
 
-def _selected_anew(given: SearchInput, found: SearchOutcome) -> SearchOutcome | None:
-    """Select effects with the slopes at the model that holds the selected ones, what they explain being added to the residuals.
+def _selected_at_fit(given: SearchInput, found: SearchOutcome) -> SearchOutcome | None:
+    """Select effects anew, with the derivatives of the residuals taken at the model that holds the effects selected before.
+
+    What these explain is added back to the residuals, so that all effects are selected again.
 
     None if no effect of the catalogue was selected, if one is out of bounds, or if too few rays meet the reference.
     """

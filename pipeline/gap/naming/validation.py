@@ -1,4 +1,4 @@
-"""Last step of the diagnosis: measure the gap with the named effects."""
+"""Last step of the diagnosis: measure how much of the gap between model and measurement the named effects close."""
 
 from __future__ import annotations
 

@@ -102,7 +102,7 @@ def validate_effects(
 
     def gains(tested: Sequence[NamedEffect], among: Sequence[NamedEffect]) -> FloatArray:
         """Validation gain in each wall block of effects among others, which stay in the model."""
-        every, out = frozenset(map(id, among)), frozenset(map(id, tested))  # two empirical terms may have one name
+        every, out = frozenset(map(id, among)), frozenset(map(id, tested))  # by object: two empirical terms may share a name
         with_all, without = registered(every), registered(every - out)
         known = np.isfinite(with_all.value) & np.isfinite(without.value)
         return _log_score_gains(with_all, without, known & ~training, residuals.wall_xy, block, patch_sigma)

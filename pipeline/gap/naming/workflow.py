@@ -160,13 +160,13 @@ def diagnose(
     clock, random = _Clock(progress), KeyedRandom(seed, ("gap",))
     # one BLAS thread: results do not depend on the number of threads, and no threads wait for each other
     with use_thresholds(thresholds), threadpool_limits(1, "blas"):
-        part, rows = subsample_measurement(_prepared(measurement), random.child("thinned"))
+        part, rows = subsample_measurement(prepared(measurement), random.child("thinned"))
         found = _diagnose(part, clock, random)
     return replace(found, residuals=replace(found.residuals, index=rows[found.residuals.index]))
 
 
-def _prepared(measurement: Measurement) -> Measurement:
-    """Store in a measurement what no pose changes: scan lines and times, or the disparities of a stereo pair."""
+def prepared(measurement: Measurement) -> Measurement:
+    """Return a copy of a measurement that stores what no pose changes: scan lines and times, or a stereo pair's disparities."""
     match measurement:
         case TlsMeasurement():
             return with_scan_order(measurement)

@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from pipeline.formats.measurements.measurement import Measurement, TlsMeasurement
+from pipeline.formats.measurements.measurement import Measurement
 from pipeline.gap.naming.named_effects import aligned_with
-from pipeline.gap.naming.workflow import GapDiagnosis
+from pipeline.gap.naming.workflow import GapDiagnosis, prepared
 from pipeline.gap.residuals.alignment import fit_pose
-from pipeline.gap.residuals.tls_residuals import with_scan_order
 from scene.geometry.mesh import FloatArray
 
 
@@ -27,7 +26,7 @@ def contributions(found: GapDiagnosis, measurement: Measurement) -> FloatArray:
     -------
     FloatArray : (k, n) parts in the unit of the observable (m or px); 0 where a ray misses the reference.
     """
-    there = with_scan_order(measurement) if isinstance(measurement, TlsMeasurement) else measurement
+    there = prepared(measurement)
     there, registration_rows = there.part(found.residuals.index), np.flatnonzero(found.residuals.usable & ~found.held_out)
     parts = []
     for effect in found.effects:

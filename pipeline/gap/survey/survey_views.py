@@ -126,7 +126,7 @@ class SurveyView:
 
 
 def _key(candidate: Candidate) -> tuple[Any, ...]:
-    """Name, fitted parameters and trial values (but for a period) of an effect, which are the same in each view of a survey."""
+    """Key that an effect has in every view of a survey: its name, fitted parameters and fixed values, without a sine's period."""
     fixed = {key: value for key, value in candidate.fixed.items() if candidate.wave is None or key != candidate.wave.key}
     return candidate.name, candidate.names, tuple(sorted(fixed.items(), key=str))
 
