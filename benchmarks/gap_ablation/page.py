@@ -1,9 +1,10 @@
 """Write the page of the ablation: what each threshold of `gap` changes, and what was done with it.
 
-    python benchmarks/gap_ablation/page.py --results docs/validation/gap_ablation.json --page docs/validation/gap_ablation.md
+    python benchmarks/gap_ablation/page.py --results FILE --deleted docs/validation/gap_ablation_deleted.json --page PAGE
     python benchmarks/gap_ablation/page.py --collect OUT --runs RUNS --measurements DIR --results FILE
 
-The second form makes the results file from the answers that `run.py` left in OUT.
+The second form makes the results file from the answers that `run.py` left in OUT. The file of `--deleted` holds those of an
+earlier run, with thresholds that were deleted or merged since.
 """
 
 from __future__ import annotations
@@ -16,9 +17,10 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks.gap_ablation.decisions import DONE
-from benchmarks.gap_ablation.run import noted
+from benchmarks.gap_ablation.run import STEP, noted
 from benchmarks.gap_ablation.settings import KEPT_OUT, MERGED, OFF
 from benchmarks.gap_ablation.sources import SOURCES, StoredCase, stored_cases
+from benchmarks.gap_ablation.steps import STEPS
 from pipeline.gap.thresholds import Thresholds
 
 Json = dict[str, Any]
@@ -38,15 +40,18 @@ def collect(out: Path, cases: list[StoredCase]) -> Json:
             if key in table:
                 acts = [case for case in asked if [key, setting] in noted(case, out)["matters"]]
                 rows[key]["settings"][setting] = {"value": table[key], **_changes(acts, f"{key}={setting}", usual, out)}
+    steps = {}
+    for step in STEPS:
+        called = [case for case in cases if [STEP, step] in noted(case, out)["matters"]]
+        steps[step] = _changes(called, f"{STEP}={step}", usual, out)
     commit = subprocess.run(["git", "rev-parse", "--short", "HEAD"], capture_output=True, text=True, check=False).stdout.strip()
     wrong = Counter(f"{case.source}: {answer['judged']}" for case, answer in usual.items() if answer and answer["judged"])
-    together = _changes(cases, "final", usual, out)
     return {
         "cases": Counter(case.source for case in cases),
         "wrong": wrong,
         "commit": commit,
-        "together": together,
         "thresholds": rows,
+        "steps": steps,
     }
 
 
@@ -74,33 +79,58 @@ def _changes(acts: list[StoredCase], name: str, usual: dict[StoredCase, Json | N
     }
 
 
-def page(results: Json, command: str) -> str:
-    """Return the page in Markdown."""
-    total = sum(results["cases"].values())
-    sources = "\n".join(f"| {SOURCES[source]} | {count} |" for source, count in results["cases"].items())
-    wrong = sum(results["wrong"].values())
+def page(results: Json, deleted: Json, command: str) -> str:
+    """Return the page in Markdown. deleted: results of the earlier run."""
+    now = {f"{group}.{name}" for group, values in Thresholds().model_dump().items() for name in values}
+    rows = {key: row for key, row in deleted["thresholds"].items() if key not in now}
+    return _PAGE.format(
+        total=sum(results["cases"].values()), sources=_sources(results), wrong=sum(results["wrong"].values()),
+        before=len(deleted["thresholds"]), after=len(now), commit=results["commit"], command=command,
+        table=_table(results["thresholds"]), steps=_steps(results["steps"]), flips=_flips(results),
+        total_before=sum(deleted["cases"].values()),
+        sources_before=_sources(deleted), table_before=_table(rows), merged=_merged(deleted["thresholds"]),
+        groups=_groups(deleted["groups"]), flips_before=_flips(deleted), commit_before=deleted["commit"],
+    )  # fmt: skip
+
+
+def _sources(results: Json) -> str:
+    """Return the rows of a table with the number of cases from each source."""
+    return "\n".join(f"| {SOURCES[source]} | {count} |" for source, count in results["cases"].items())
+
+
+def _table(thresholds: Json) -> str:
+    """Return a table of what each threshold's rule changes, and what was done with it."""
     lines = [
         "| threshold | value | off at | uses it | acts | diagnosed | other answer | became wrong | became right | done |",
         "|---|---|---|---|---|---|---|---|---|---|",
     ]
-    merged = [
-        "| threshold | value | tried | acts | diagnosed | other answer | became wrong | became right |",
-        "|---|---|---|---|---|---|---|---|",
-    ]
-    for key, row in results["thresholds"].items():
-        off, other = row["settings"].get("off"), row["settings"].get("merged")
+    for key, row in thresholds.items():
+        off = row["settings"].get("off")
         done = DONE.get(key, f"kept: {KEPT_OUT[key]}" if key in KEPT_OUT else "kept")
         cells = _cells(off) if off else "- | - | - | - | -"
         value = "-" if off is None else _number(off["value"])
         lines.append(f"| `{key}` | {_number(row['value'])} | {value} | {row['asked']} | {cells} | {done} |")
+    return "\n".join(lines)
+
+
+def _steps(steps: Json) -> str:
+    """Return a table of what each step changes, of those that were switched off in some case."""
+    lines = ["| step | called | diagnosed | other answer | became wrong | became right |", "|---|---|---|---|---|---|"]
+    lines += [f"| {step} | {_cells(found)} |" for step, found in steps.items() if found["diagnosed"]]
+    return "\n".join(lines)
+
+
+def _merged(thresholds: Json) -> str:
+    """Return a table of values of similar thresholds that were tried."""
+    lines = [
+        "| threshold | value | tried | acts | diagnosed | other answer | became wrong | became right |",
+        "|---|---|---|---|---|---|---|---|",
+    ]
+    for key, row in thresholds.items():
+        other = row["settings"].get("merged")
         if other and other["diagnosed"] == other["acts"]:
-            merged.append(f"| `{key}` | {_number(row['value'])} | {_number(other['value'])} | {_cells(other)} |")
-    before, after = len(results["thresholds"]), sum(len(group) for group in Thresholds().model_dump().values())
-    return _PAGE.format(
-        total=total, sources=sources, wrong=wrong, before=before, after=after, commit=results["commit"], command=command,
-        table="\n".join(lines), merged="\n".join(merged), flips=_flips(results), together=_together(results),
-        groups=_groups(results.get("groups", [])), final_commit=results.get("final_commit", results["commit"]),
-    )  # fmt: skip
+            lines.append(f"| `{key}` | {_number(row['value'])} | {_number(other['value'])} | {_cells(other)} |")
+    return "\n".join(lines)
 
 
 def _cells(found: Json) -> str:
@@ -110,22 +140,6 @@ def _cells(found: Json) -> str:
     return (
         f"{found['acts']} | {found['diagnosed']} | {found['other answers']} | {len(found['became wrong'])} | "
         f"{len(found['became right'])}"
-    )
-
-
-def _together(results: Json) -> str:
-    """Return a paragraph on the cases that were diagnosed with the thresholds that are left."""
-    said = f"With the thresholds that are left, {_turned(results['together'], 'of the cases were diagnosed again')}"
-    fresh = results.get("fresh")
-    return said if fresh is None else f"{said} {_turned(fresh, 'further cases in closed form were diagnosed with both')}"
-
-
-def _turned(found: Json, cases: str) -> str:
-    """Say how many answers differ, become wrong and become right; cases: what follows their number."""
-    changes = ", ".join([*found["became wrong"], *found["became right"], *found["other errors"]])
-    return (
-        f"{found['diagnosed']} {cases}: {found['other answers']} have another verdict or other names, "
-        f"{len(found['became wrong'])} became wrong, and {len(found['became right'])} became right{changes and f' ({changes})'}."
     )
 
 
@@ -141,27 +155,29 @@ def _number(value: float) -> str:
 
 def _flips(results: Json) -> str:
     """Return a table of all answers that become wrong or right."""
-    lines = ["| threshold | setting | case | change |", "|---|---|---|---|"]
-    for key, row in results["thresholds"].items():
-        for setting, found in row["settings"].items():
+    lines = ["| what | setting | case | change |", "|---|---|---|---|"]
+    rows = {f"`{key}`": row["settings"] for key, row in results["thresholds"].items()}
+    rows |= {step: {"off": found} for step, found in results.get("steps", {}).items()}
+    for name, settings in rows.items():
+        for setting, found in settings.items():
             for kind in ("became wrong", "became right", "other errors"):
                 for each in found[kind]:
                     case, _, what = each.partition(": ")
                     words = {"became wrong": f"right to {what}", "became right": f"{what} to right", "other errors": what}[kind]
-                    lines.append(f"| `{key}` | {'off' if setting == 'off' else found['value']} | {case} | {words} |")
+                    lines.append(f"| {name} | {'off' if setting == 'off' else found['value']} | {case} | {words} |")
     return "\n".join(lines)
 
 
 _PAGE = """# What `gap` needs its thresholds for
 
 This page is for developers of `scarpsim gap`. It shows for each threshold what the diagnosis loses without the rule behind
-it, and which thresholds were deleted or merged therefore: there were {before}, now there are {after}. [What each threshold
+it, and which thresholds were deleted or merged: there were {before}, now there are {after}. [What each threshold
 does](gap_thresholds.md) says how far answers depend on the value of a threshold, and what each decides.
 
-Each case was diagnosed with the usual thresholds, which named a wrong effect, missed one or gave a false alarm in {wrong}
-of {total} cases. The diagnosis also carried, for each threshold, the value with which its rule never acts, and recorded
-whether a decision would differ. Only then was the case diagnosed again, with that rule off. As each case was diagnosed only
-so often as time allowed, the column "diagnosed" can be smaller than "acts".
+Each of {total} cases was diagnosed with the usual thresholds, which named a wrong effect, missed one or gave a false alarm in
+{wrong} of them. The diagnosis also carried, for each threshold, the value with which its rule never acts, and recorded whether a
+decision would differ. Only then was the case diagnosed again, with that rule off; at most 12 cases of a threshold, drawn at
+random, and fewer where time was up.
 
 | source | cases |
 |---|---|
@@ -180,36 +196,55 @@ A rule that acts in no case changed nothing that could be measured here. It was 
 program requires it. It stays if no case came to it, if it limits the damage of measurements that are not among the cases,
 or if it belongs to what `gap` promises, such as classes of effects that cannot be told apart.
 
-{together}
-
 {table}
 
-## Values that were tried in place of others
+## Steps
+
+[What `gap` needs its steps for](gap_steps.md) explains these. They were switched off in some of the same cases. "Called" counts
+the cases in which the step is called, whether it then does something or not. The steps that are missing here are called in every
+case; that page says in which they do something.
+
+{steps}
+
+## Answers that change
+
+{flips}
+
+## Thresholds that were deleted or merged
+
+An earlier run had {total_before} cases, and all thresholds that there were. Most rules that act were not switched off one by
+one, so "diagnosed" is often 0.
+
+| source | cases |
+|---|---|
+{sources_before}
+
+{table_before}
+
+### Values that were tried in place of others
 
 Thresholds of the same kind can share one value. These values were tried. Where no answer became wrong, the threshold could be
 merged with the one whose value it shares.
 
 {merged}
 
-## Thresholds that were changed in groups
+### Thresholds that were changed in groups
 
-A diagnosis takes up to a minute, so most rules that act could not be switched off one by one. They were changed in two groups:
-deleted, or set to the value of a threshold of the same kind. Where an answer of a case differed, halves of the group were tried
-until the cause was found, or the notes of the answer told it. These settings were a cause:
+Two groups of rules were changed together: deleted, or set to the value of a threshold of the same kind. Where an answer of a
+case differed, halves of the group were tried until the cause was found, or the notes of the answer told it. These settings were a
+cause:
 
 {groups}
 
-## Answers that change
+### Answers that changed
 
-{flips}
+{flips_before}
 
 ## How it was made
 
-Made at commit {commit} by:
+The first table was made at commit {commit}, the others at commit {commit_before}, by:
 
     {command}
-
-The answers with the thresholds that are left were made at commit {final_commit}, with `--final` and an `--order` of some cases.
 """
 
 
@@ -220,14 +255,16 @@ def main() -> None:
     parser.add_argument("--runs", type=Path)
     parser.add_argument("--measurements", type=Path)
     parser.add_argument("--results", type=Path, required=True)
+    parser.add_argument("--deleted", type=Path, help="results of the earlier run, for --page")
     parser.add_argument("--page", type=Path)
     given = parser.parse_args()
     if given.collect:
         results = collect(given.collect, stored_cases(given.runs, given.measurements))
         given.results.write_text(json.dumps(results, indent=1) + "\n")
     if given.page:
-        command = "python benchmarks/gap_ablation/run.py --runs RUNS --measurements DIR --out OUT"
-        given.page.write_text(page(json.loads(given.results.read_text()), command))
+        command = "python benchmarks/gap_ablation/run.py --runs RUNS --measurements DIR --out OUT --most 12"
+        results, deleted = (json.loads(each.read_text()) for each in (given.results, given.deleted))
+        given.page.write_text(page(results, deleted, command))
 
 
 if __name__ == "__main__":

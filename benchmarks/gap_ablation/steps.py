@@ -1,4 +1,4 @@
-"""Switch off single steps of `gap`, one at a time, and print the answers that change.
+"""Switch off single steps of `gap`, one at a time, and print the answers that change. `run.py` does so on stored cases.
 
     python benchmarks/gap_ablation/steps.py FOLDER [FOLDER ...] [--step NAME ...]
 
@@ -9,8 +9,9 @@ A FOLDER is a measurement or holds measurements. Each is diagnosed with all step
 from __future__ import annotations
 
 import argparse
-from collections.abc import Iterator
-from contextlib import ExitStack
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack, contextmanager
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 from unittest.mock import patch
@@ -47,11 +48,52 @@ STEPS: dict[str, tuple[Any, str, Any]] = {
 """What replaces each step: the module or class that holds it, its name there, and a replacement that does nothing."""
 
 
-def answer(folder: Path, steps: list[str] | None = None) -> str:
-    """Return verdict and named effects of a measurement. steps: names of the steps to switch off."""
+@contextmanager
+def switched_off(steps: Sequence[str]) -> Iterator[None]:
+    """Switch off steps, by their names in `STEPS`, inside a `with` block."""
     with ExitStack() as off:
-        for owner, name, nothing in (STEPS[step] for step in steps or []):
+        for owner, name, nothing in (STEPS[step] for step in steps):
             off.enter_context(patch.object(owner, name, nothing))
+        yield
+
+
+@contextmanager
+def noting_steps(used: set[str]) -> Iterator[None]:
+    """Add the names of steps that run inside a `with` block to `used`."""
+    with ExitStack() as on:
+        for step, (owner, name, _) in STEPS.items():
+            on.enter_context(patch.object(owner, name, _noting(vars(owner)[name], step, used)))
+        yield
+
+
+def _noting(part: Any, step: str, used: set[str]) -> Any:
+    """Return a part of the program (a function, cached property or tuple) that adds the step to `used` when it is used."""
+    if isinstance(part, cached_property):
+        return property(_noting(part.__get__, step, used))
+    if isinstance(part, tuple):
+        return _NotedTuple(part, step, used)
+
+    def called(*arguments: Any, **options: Any) -> Any:
+        used.add(step)
+        return part(*arguments, **options)
+
+    return called
+
+
+class _NotedTuple:
+    """The items of a tuple, which adds a step to a set when they are read in turn."""
+
+    def __init__(self, items: tuple[Any, ...], step: str, used: set[str]) -> None:
+        self._items, self._step, self._used = items, step, used
+
+    def __iter__(self) -> Iterator[Any]:
+        self._used.add(self._step)
+        return iter(self._items)
+
+
+def answer(folder: Path, steps: Sequence[str] = ()) -> str:
+    """Return verdict and named effects of a measurement. steps: names of the steps to switch off."""
+    with switched_off(steps):
         found = workflow.diagnose(read_measurement(folder))
     named = (f"{item.name} {{{', '.join(item.indistinguishable)}}}" for item in found.effects)
     return f"{found.verdict}: {', '.join(named) or 'nothing named'}"
