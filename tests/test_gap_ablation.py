@@ -11,6 +11,9 @@ import pytest
 from benchmarks.gap_ablation import page, run, steps
 from benchmarks.gap_ablation.settings import KEPT_OUT, MERGED, OFF, changed, others
 from benchmarks.gap_ablation.sources import StoredCase, stored_cases
+from pipeline.gap.naming import validation_scores
+from pipeline.gap.naming.selection_passes import PassInputs
+from pipeline.gap.noise_and_edges import disparity_edges
 from pipeline.gap.thresholds import Thresholds
 
 KEYS = [f"{group}.{name}" for group, found in Thresholds().model_dump().items() for name in found]
@@ -54,23 +57,30 @@ def test_a_name_where_there_is_nothing_is_a_false_alarm(wall: StoredCase) -> Non
 def test_a_case_is_diagnosed_again_only_where_a_decision_would_differ(
     wall: StoredCase, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The page counts the case in which the rule acts, and that its answer becomes wrong."""
+    """The page counts the case in which the rule acts or the step is called, and that its answer becomes wrong."""
     out = tmp_path / "out"
+    settings = [("variance.least_gain", "off"), ("step", "heavy tails")]
 
     def answered(folder: Path, thresholds: Any) -> dict[str, Any]:
         assert folder == wall.folder
         alarm = thresholds.variance.least_gain < 0
         return {"verdict": "unknown" if alarm else "no_gap", "effects": [], "wall_s": 1.0}
 
-    _write(out / "second/0001/asked.json", {"asked": ["variance.least_gain"], "matters": [["variance.least_gain", "off"]]})
+    _write(out / "second/0001/asked.json", {"asked": ["variance.least_gain"], "matters": [*map(list, settings)]})
     _write(out / "second/0001/usual.json", answered(wall.folder, Thresholds()))
     monkeypatch.setattr(run, "diagnosed", answered)
-    (job,) = run.jobs([wall], out, [])
-    assert job == (wall, ("variance.least_gain", "off"))
-    run.again(wall, [job[1]], "variance.least_gain=off", out)
+    assert run.jobs([wall], out, [], 9) == [(wall, each) for each in settings]
+    assert run.jobs([wall], out, ["step=heavy tails"], 9) == [(wall, settings[1])]
+    assert not run.jobs([wall], out, [], 0)
+    for each in settings:
+        run.again(wall, [each], "=".join(each), out)
     results = page.collect(out, [wall])
+    assert {step for step, found in results["steps"].items() if found["diagnosed"]} == {"heavy tails"}
     assert results["thresholds"]["variance.least_gain"]["settings"]["off"]["became wrong"] == ["second 0001: false alarm"]
-    written = page.page(json.loads(json.dumps(results)), "make")
+    earlier = {**results, "groups": [], "thresholds": {"mean.gone": results["thresholds"]["mean.class_margin"]}}
+    written = page.page(*json.loads(json.dumps([results, earlier])), "make")
+    assert "| heavy tails | 1 | 1 | 0 | 0 | 0 |" in written
+    assert "| `mean.gone` | 3 | 0 | 0 | 0 | 0 | 0 | 0 | 0 | kept |" in written
     assert "| `variance.least_gain` | 6 | none | 1 | 1 | 1 | 1 | 1 | 0 | kept |" in written
     assert "| `variance.least_gain` | off | second 0001 | right to false alarm |" in written
 
@@ -78,6 +88,21 @@ def test_a_case_is_diagnosed_again_only_where_a_decision_would_differ(
 def test_each_step_of_the_diagnosis_has_a_replacement_of_its_kind() -> None:
     for owner, name, nothing in steps.STEPS.values():
         assert callable(getattr(owner, name)) == callable(nothing), name
+
+
+def test_steps_that_run_are_noted() -> None:
+    """A function, the items of a tuple and a cached property are noted when they are used, and not before."""
+    used: set[str] = set()
+    with steps.noting_steps(used):
+        assert not used
+        assert validation_scores._groups([]) == []
+        assert used == {"groups of effects validated"}
+        assert list(disparity_edges._WINDOWS) == ["disc", "square"]
+        inputs = PassInputs.__new__(PassInputs)
+        inputs.__dict__["_best_single_effect"] = None
+        assert inputs._best_single_effect is None
+    assert used == {"groups of effects validated", "windows of edge fattening", "best single effect"}
+    assert isinstance(disparity_edges._WINDOWS, tuple)
 
 
 def test_answers_that_change_without_a_step_are_printed(
