@@ -201,8 +201,8 @@ or if it belongs to what `gap` promises, such as classes of effects that cannot 
 ## Steps
 
 [What `gap` needs its steps for](gap_steps.md) explains these. They were switched off in some of the same cases. "Called" counts
-the cases in which the step is called, whether it then does something or not. The steps that are missing here are called in every
-case; that page says in which they do something.
+the cases in which the step is called, whether it then does something or not. The steps that are missing here were not switched
+off in these cases.
 
 {steps}
 
