@@ -177,7 +177,8 @@ does](gap_thresholds.md) says how far answers depend on the value of a threshold
 Each of {total} cases was diagnosed with the usual thresholds, which named a wrong effect, missed one or gave a false alarm in
 {wrong} of them. The diagnosis also carried, for each threshold, the value with which its rule never acts, and recorded whether a
 decision would differ. Only then was the case diagnosed again, with that rule off; at most 12 cases of a threshold, drawn at
-random, and fewer where time was up.
+random, and fewer where time was up. So few cases can show that a rule is needed, but not that it is needless: if no answer
+changes in 12 cases, the rule may still change up to 22 % of those in which it acts (95 % confidence).
 
 | source | cases |
 |---|---|
