@@ -21,6 +21,7 @@ from pipeline.gap.mean.candidates import Candidate
 from pipeline.gap.mean.nonparametric_terms import SPATIAL_NULL
 from pipeline.gap.mean.selection import EffectSet, FamilyScore, ForwardSelection
 from pipeline.gap.naming.named_effects import NamedEffect
+from pipeline.gap.naming.selection_notes import _note_pairs
 from pipeline.gap.naming.selection_passes import subsample
 from pipeline.gap.naming.validation_scores import (
     ValidatedEffects,
@@ -293,6 +294,34 @@ def test_what_does_as_well_beside_the_other_camera_is_of_the_class() -> None:
         "tangential_distortion": (),
         "camera_shift": ("focal_length",),
     }
+
+
+class _Turns(_Scripted):
+    """A search in which two turns of a camera explain together what another turn explains alone; 5 is significant."""
+
+    def __init__(self, pair: float) -> None:
+        beside = {
+            frozenset[str](): {"camera_kappa": 50.0, "camera_phi": 10.0, "camera_omega": 4.0},
+            frozenset({"camera_phi"}): {"camera_omega": pair - 10.0, "camera_kappa": 39.0},
+            frozenset({"camera_omega"}): {"camera_phi": pair - 4.0},
+            frozenset({"camera_kappa"}): {"camera_phi": 1.0, "camera_omega": 1.0},
+        }
+        super().__init__(lambda known: {(name, ""): score for name, score in beside.get(frozenset(known), {}).items()})
+
+    def p_value(self, score: float) -> float:
+        return 0.001 if score >= 5 else 0.5
+
+
+@pytest.mark.parametrize(("pair", "alike"), [(52.0, ("camera_omega", "camera_phi")), (49.0, ())])
+def test_two_effects_that_explain_more_than_one_cannot_be_told_from_it(pair: float, alike: tuple[str, ...]) -> None:
+    """The one effect, which scores 50, is chosen because the gain of 2 by the pair is not significant."""
+    (only,) = ForwardSelection(_Turns(pair)).select()[0]
+    assert only.candidate.name == "camera_kappa"
+    assert only.indistinguishable == only.replacing_pair == alike
+    estimate: Any = SimpleNamespace(candidate=only.candidate, chosen=only)
+    part: Any = SimpleNamespace(sensor="stereo")
+    said = "stereo.camera_omega and stereo.camera_phi together explain the residuals as well as stereo.camera_kappa"
+    assert _note_pairs([estimate], part) == ([said] if alike else [])
 
 
 @pytest.mark.parametrize(("places", "named"), [(5.0, {"collimation", "range_scale"}), (75.0, set())])

@@ -27,6 +27,7 @@ from pipeline.gap.naming.named_effects import NamedEffect, effect_from_estimate
 from pipeline.gap.naming.nonlinear_refit import (
     _screened_single_fits,
     _strongest_single_fits,
+    _with_classes_at_fit,
     _with_equivalence_class,
     select_and_refit,
 )
@@ -209,6 +210,22 @@ def test_two_large_effects_are_found_with_the_derivatives_at_the_fitted_model(
     assert len(first.select()[0]) > 2
     found = {each.candidate.name for each in select_and_refit(points, first).estimates}
     assert found in ({"focal_length", name} for name in ("camera_kappa", "affinity_skew"))  # a turn is a skew
+
+
+def test_an_effect_gets_its_class_beside_those_that_were_found_later(
+    turned_and_zoomed: tuple[SearchInput, dict[str, dict[str, Any]]],
+) -> None:
+    """Beside the focal length, a turn of an image fits about as well as a skew, and a shift of the camera fits worse."""
+    points, _ = turned_and_zoomed
+    first = MeanSearch(with_fitted_variance(points.part, [], 1.0), points.families, KeyedRandom(1))
+    found, earlier = select_and_refit(points, first), ("camera_kappa", "camera_shift")
+    before = [replace(each, chosen=replace(each.chosen, indistinguishable=earlier)) for each in found.estimates]
+    found_later = _with_classes_at_fit(points, replace(found, chosen=found.chosen[:1], estimates=before)).estimates
+    alike = {each.candidate.name: {each.candidate.name, *each.chosen.indistinguishable} for each in found_later}
+    assert alike.pop("focal_length") == {"focal_length"}
+    assert list(alike.values()) == [{"camera_kappa", "affinity_skew"}]
+    found_at_once = replace(found, estimates=before)
+    assert _with_classes_at_fit(points, found_at_once) is found_at_once
 
 
 @pytest.mark.parametrize(

@@ -61,13 +61,14 @@ class SelectedEffect:
     Attributes
     ----------
     candidate : The best variant of the error, for example with its best period.
-    indistinguishable : Names of the effects that would score as well in its place.
+    indistinguishable : Names of the effects that would score as well in its place, `replacing_pair` included.
     p_value : Probability that the best of all candidates scores as much by chance; so it is corrected for multiple testing.
     log_likelihood_ratio : Log-likelihood with the error minus that without it; the other selected effects are in the model
         both times.
     score : Log-likelihood ratio minus a penalty for what is fitted.
     family_scores : Scores of all candidates in place of this error, with the other selected effects in the model. If the error
         is a non-parametric term, no other effect is in the model.
+    replacing_pair : Names of two effects that would score higher in its place, but only together; empty if there are none.
     """
 
     candidate: Candidate
@@ -76,6 +77,7 @@ class SelectedEffect:
     log_likelihood_ratio: float
     score: float
     family_scores: tuple[FamilyScore, ...]
+    replacing_pair: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -128,6 +130,14 @@ def _replacements(names: set[str], name: str, margin: float, scores: SetScores) 
     others, least = names - {name}, scores.get(frozenset(names), math.inf) - margin
     as_good = [each for each, score in scores.items() if others < each and len(each) == len(names) and score > least]
     return [other for each in sorted(as_good, key=lambda each: -scores[each]) for other in each - others if other != name]
+
+
+def _replacing_pair(names: set[str], name: str, scores: SetScores) -> tuple[str, ...]:
+    """Return the two effects that best replace `name` in the set `names`; empty unless the joint score rises with them."""
+    others, least = names - {name}, scores.get(frozenset(names), math.inf)
+    larger = [each for each in scores if others < each and name not in each and len(each) == len(names) + 1]
+    best = max(larger, key=lambda each: scores[each], default=None)
+    return () if best is None or scores[best] <= least else tuple(sorted(best - others))
 
 
 def _least_nonparametric_score() -> float:
@@ -198,10 +208,10 @@ class ForwardSelection:
         levels, scores = [[empty]], SetScores()
         while len(levels) <= thresholds().mean.most_effects:
             grown, of_sets = self._grow(levels[-1])
+            scores |= of_sets  # those of the size that is not accepted too: two effects may replace one
             if not grown or not self._significant(grown[0].score - levels[-1][0].score):
                 break
             levels.append(grown)
-            scores |= of_sets
         if (found := self._nonparametric_term(levels)) is not None:
             members, form = found[0], self.search.with_harmonics(*found)
             p_value, ratio = self.search.p_value(form.score), form.log_likelihood_ratio
@@ -265,7 +275,8 @@ class ForwardSelection:
         margin = equivalence_margin(ratio)
         alike = [each.name for each in beside if each is not mine and each.score > mine.score - margin]
         alike += _replacements(names | {item.name}, item.name, margin, scores)
-        return SelectedEffect(item.candidate, tuple(dict.fromkeys(alike)), p_value, ratio, mine.score, tried)
+        pair = _replacing_pair(names | {item.name}, item.name, scores)
+        return SelectedEffect(item.candidate, tuple(dict.fromkeys([*alike, *pair])), p_value, ratio, mine.score, tried, pair)
 
     def _significant(self, score: float) -> bool:
         """Tell whether a score is significant."""

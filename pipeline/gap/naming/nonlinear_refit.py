@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -9,7 +10,7 @@ import numpy as np
 from pipeline.formats.measurements.measurement import Measurement
 from pipeline.gap.mean.candidates import Candidate
 from pipeline.gap.mean.search import MeanSearch
-from pipeline.gap.mean.selection import SelectedEffect
+from pipeline.gap.mean.selection import FamilyScore, ForwardSelection, SelectedEffect
 from pipeline.gap.naming.candidate_families import candidate_families, catalogue_families
 from pipeline.gap.naming.effect_screening import gauss_newton_step, screen_effects
 from pipeline.gap.naming.named_effects import Estimate, out_of_bounds
@@ -126,6 +127,11 @@ def select_and_refit(given: SearchInput, first: MeanSearch) -> SearchOutcome:
     -------
     SearchOutcome : the explanation with the fewest empirical terms, and of these the one with the fewest effects.
     """
+    return _with_classes_at_fit(given, _selected_and_refitted(given, first))
+
+
+def _selected_and_refitted(given: SearchInput, first: MeanSearch) -> SearchOutcome:
+    """Select the effects, as `select_and_refit` does, with the equivalence classes of the searches that found them."""
     together, tried = first.select()
     linear = SearchOutcome(together, estimates_of(first, together), first, given.part, together, tried)
     alone = _strongest_single_fits(given, first, together) if together else None
@@ -164,22 +170,77 @@ def _selected_at_fit(given: SearchInput, found: SearchOutcome) -> SearchOutcome 
 
     None if no effect of the catalogue was selected, if one is out of bounds, or if too few rays meet the reference.
     """
-    known = [each for each in found.estimates if not each.candidate.empirical]
-    if not known or not _within_bounds(given, found):
+    at_fit = _search_at_fit(given, found)
+    if at_fit is None:
         return None
-    measurement, moved, _ = aligned_with_estimates(given, known)
+    search, left, _ = at_fit
+    together, tried = search.select()
+    return SearchOutcome(together, estimates_of(search, together), search, left, together, tried)
+
+
+def _search_at_fit(given: SearchInput, found: SearchOutcome) -> tuple[MeanSearch, Residuals, list[Candidate]] | None:
+    """Prepare a search with the derivatives of the residuals taken at the model that holds the effects of an explanation.
+
+    What these explain is added back to the residuals, so that the search can select all of them again.
+
+    Returns
+    -------
+    search : the search.
+    left : the residuals that it explains.
+    known : the effects of the explanation as regression terms of this search, without empirical terms.
+
+    None if the explanation has no effect of the catalogue, if one is out of bounds, or if too few rays meet the reference.
+    """
+    physical = [each for each in found.estimates if not each.candidate.empirical]
+    if not physical or not _within_bounds(given, found):
+        return None
+    measurement, moved, _ = aligned_with_estimates(given, physical)
     at = with_added_variance(at_points_of(moved, given.part), given.added)
     if too_few_left(given, at):
         return None
     catalogue = catalogue_families(measurement, at)
-    columns = (recomputed(each.candidate, catalogue).columns for each in known)
-    explained = sum(matrix @ each.values[: matrix.shape[1]] for matrix, each in zip(columns, known, strict=True))
+    known = [recomputed(each.candidate, catalogue) for each in physical]
+    pairs = zip(known, physical, strict=True)
+    explained = sum(term.columns @ each.values[: term.columns.shape[1]] for term, each in pairs)
     allowed = {(family.name, family.empirical) for family in given.families}
     families = [each for each in candidate_families(measurement, at, catalogue) if (each.name, each.empirical) in allowed]
     left = replace(at, value=at.value + explained)
     search = MeanSearch(replace(with_variance_refitted(given, at), value=left.value), families, given.random.child("again"))
-    together, tried = search.select()
-    return SearchOutcome(together, estimates_of(search, together), search, left, together, tried)
+    return search, left, known
+
+
+def _with_classes_at_fit(given: SearchInput, found: SearchOutcome) -> SearchOutcome:
+    """Find the equivalence classes again if the second search added effects, because those of the first search lack these.
+
+    An explanation with an empirical term keeps its classes, and so does one that cannot be put into the model.
+    """
+    if len(found.estimates) <= len(found.chosen) or any(each.candidate.empirical for each in found.estimates):
+        return found
+    at_fit = _search_at_fit(given, found)
+    if at_fit is None:
+        return found
+    search, _, known = at_fit
+    members = tuple(FamilyScore(each.name, False, 0.0, 0.0, each) for each in known)
+    estimates = []
+    for each, item in zip(found.estimates, members, strict=True):
+        refitted = ForwardSelection(search).with_equivalents(members, item, {})
+        scores = {other.name: other.score for other in refitted.family_scores if not other.empirical}
+        estimates.append(replace(each, chosen=_with_class(each.chosen, refitted, scores)))
+    return replace(found, estimates=estimates)
+
+
+def _with_class(chosen: SelectedEffect, refitted: SelectedEffect, scores: Mapping[str, float]) -> SelectedEffect:
+    """Return an effect with the effects that a refit cannot tell from it (its equivalence class).
+
+    For effects that were not refitted, the search before decides. One that this search could not tell from the effect must score
+    worse by twice the margin in the refit, because either has its own error.
+
+    chosen: the effect, with its class in the search before; refitted: the same in the refit; scores: of other effects there.
+    """
+    margin, before = equivalence_margin(refitted.log_likelihood_ratio), set(chosen.indistinguishable)
+    near = {name for name, score in scores.items() if score > refitted.score - (1 + (name in before)) * margin}
+    alike = (near | (before - set(scores))) - {chosen.candidate.name}
+    return replace(chosen, indistinguishable=tuple(sorted(alike)))
 
 
 def _simpler(given: SearchInput, best: SearchOutcome | None, other: SearchOutcome, ties: bool) -> SearchOutcome | None:
@@ -294,19 +355,11 @@ def _registered_residuals(found: Residuals, part: Residuals) -> tuple[FloatArray
 
 
 def _with_equivalence_class(converged: list[_SingleFit]) -> _SingleFit:
-    """Return the best of the refitted single effects with the effects that cannot be told from it (its equivalence class).
-
-    For effects that were not refitted, the linearised search decides. One that it could not tell from the best must score worse
-    by twice the margin here, because either search has its own error.
-    """
+    """Return the best of the refitted single effects, with the effects that cannot be told from it."""
     best, *others = converged
     chosen = best.estimate.chosen
-    margin, linearised = equivalence_margin(chosen.log_likelihood_ratio), set(chosen.indistinguishable)
-    near = {each.name for each in others if each.score > best.score - (1 + (each.name in linearised)) * margin}
-    linearised -= {each.name for each in others}
-    return replace(
-        best, estimate=replace(best.estimate, chosen=replace(chosen, indistinguishable=tuple(sorted(near | linearised))))
-    )
+    classed = _with_class(chosen, replace(chosen, score=best.score), {each.name: each.score for each in others})
+    return replace(best, estimate=replace(best.estimate, chosen=classed))
 
 
 def _converged(given: SearchInput, first: MeanSearch, alone: _SingleFit) -> _SingleFit:
