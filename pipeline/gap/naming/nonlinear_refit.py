@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -37,14 +37,14 @@ _ABSORBED_SHARE = 0.5
 
 
 @dataclass(frozen=True)
-class _SingleFit:
-    """One effect alone in the model, without linearising.
+class _Refit:
+    """One or more effects in the model, without linearising.
 
-    estimate: the effect; residuals, measurement: with it in the model, at the estimated pose; value: (n,) registered
+    estimates: the effects; residuals, measurement: with them in the model, at the estimated pose; value: (n,) registered
     residuals of all points, 0 where a point is not used; used: (n,) points that are used; log_likelihood: of these points.
     """
 
-    estimate: Estimate
+    estimates: tuple[Estimate, ...]
     residuals: Residuals
     measurement: Measurement
     value: FloatArray
@@ -53,60 +53,87 @@ class _SingleFit:
 
     @property
     def name(self) -> str:
-        """Name of the effect."""
-        return self.estimate.candidate.name
+        """Name of the first effect."""
+        return self.estimates[0].candidate.name
+
+    @property
+    def candidates(self) -> list[Candidate]:
+        """The effects as regression terms of the linearised model."""
+        return [each.candidate for each in self.estimates]
 
     @property
     def score(self) -> float:
         """Penalised log-likelihood."""
-        return self.log_likelihood - (self.estimate.chosen.log_likelihood_ratio - self.estimate.chosen.score)
+        return self.log_likelihood - sum(each.chosen.log_likelihood_ratio - each.chosen.score for each in self.estimates)
 
     @classmethod
-    def of(cls, given: SearchInput, first: MeanSearch, estimate: Estimate) -> _SingleFit | None:
-        """Put one effect into the model; None if it is out of bounds, or if too few rays meet the reference with it."""
-        if out_of_bounds(given.measurement, [estimate], given.part):
+    def of(cls, given: SearchInput, first: MeanSearch, estimates: Sequence[Estimate]) -> _Refit | None:
+        """Put effects into the model; None if one is out of bounds, or if too few rays meet the reference with them."""
+        if out_of_bounds(given.measurement, [*estimates], given.part):
             return None
-        measurement, found, _ = aligned_with_estimates(given, [estimate])
+        measurement, found, _ = aligned_with_estimates(given, [*estimates])
         found = found.part(np.isin(found.index, given.part.index))
         at = at_points_of(found, given.part)
         if too_few_left(given, at):
             return None
         value, kept = _registered_residuals(found, given.part)
-        return cls(estimate, at, measurement, value, kept, first.design.log_likelihood(value, [estimate.candidate]))
+        likelihood = first.design.log_likelihood(value, [each.candidate for each in estimates])
+        return cls(tuple(estimates), at, measurement, value, kept, likelihood)
 
     def is_significant(self, given: SearchInput, first: MeanSearch) -> bool:
         """Tell whether the score is significant: the best of all effects reaches it by chance with p <= `mean.significance`."""
-        candidate = self.estimate.candidate
+        (candidate,) = self.candidates
         linearised = first.design.log_likelihood(np.where(self.used, given.part.value, 0.0), [candidate])
         score = first.score_alone(candidate) + self.log_likelihood - linearised
         return first.p_value(score) <= thresholds().mean.significance
 
-    def improved(self, given: SearchInput, first: MeanSearch) -> _SingleFit | None:
+    def improved(self, given: SearchInput, first: MeanSearch) -> _Refit | None:
         """Return the fit after one Gauss-Newton step from the present values; None for the reasons of `of`."""
-        candidate = recomputed(self.estimate.candidate, catalogue_families(self.measurement, self.residuals))
-        step = gauss_newton_step(self.residuals, [candidate])
-        return _SingleFit.of(given, first, replace(self.estimate, values=self.estimate.values + step))
+        catalogue = catalogue_families(self.measurement, self.residuals)
+        terms = [recomputed(each, catalogue) for each in self.candidates]
+        widths = [each.columns.shape[1] for each in terms]
+        present = [each.values[:width] for each, width in zip(self.estimates, widths, strict=True)]
+        changes = np.split(gauss_newton_step(self.residuals, terms, np.concatenate(present)), np.cumsum(widths)[:-1])
+        changed = [
+            replace(each, values=np.concatenate([values + change, each.values[len(values) :]]))
+            for each, values, change in zip(self.estimates, present, changes, strict=True)
+        ]
+        return _Refit.of(given, first, changed)
 
 
-def _on_common_points(fits: list[_SingleFit], first: MeanSearch) -> list[_SingleFit]:
+def _on_common_points(fits: list[_Refit], first: MeanSearch) -> list[_Refit]:
     """Return the fits with their log-likelihoods on the points that all of them use, so that none gains by leaving out points."""
     common, design = np.all([each.used for each in fits], axis=0), first.design
     values = (np.where(common, each.value, 0.0) for each in fits)
     return [
-        replace(each, log_likelihood=design.log_likelihood(value, [each.estimate.candidate]))
+        replace(each, log_likelihood=design.log_likelihood(value, each.candidates))
         for each, value in zip(fits, values, strict=True)
     ]
 
 
-def _ranked_on_common_points(fits: list[_SingleFit], first: MeanSearch) -> list[_SingleFit]:
+def _ranked_on_common_points(fits: list[_Refit], first: MeanSearch) -> list[_Refit]:
     """Return the fits with log-likelihoods on the points that all of them use, best first."""
     return sorted(_on_common_points(fits, first), key=lambda each: -each.score)
 
 
-def _gain_over(later: _SingleFit, earlier: _SingleFit, first: MeanSearch) -> float:
+def _gain_over(later: _Refit, earlier: _Refit, first: MeanSearch) -> float:
     """Log-likelihood ratio of two fits."""
     after, before = _on_common_points([later, earlier], first)
     return after.log_likelihood - before.log_likelihood
+
+
+def _several_fit_better(given: SearchInput, first: MeanSearch, linear: SearchOutcome, one: _Refit) -> bool:
+    """Tell whether the effects that the linearised search selected explain significantly more together than one effect.
+
+    All are compared without linearising.
+    """
+    if len(linear.estimates) < 2 or any(each.candidate.empirical for each in linear.estimates):
+        return False
+    start = _Refit.of(given, first, linear.estimates)
+    if start is None:
+        return False
+    together, alone = _on_common_points([_converged(given, first, start), one], first)
+    return first.p_value(together.score - alone.score) <= thresholds().mean.significance
 
 
 def select_and_refit(given: SearchInput, first: MeanSearch) -> SearchOutcome:
@@ -137,13 +164,15 @@ def _selected_and_refitted(given: SearchInput, first: MeanSearch) -> SearchOutco
     alone = _strongest_single_fits(given, first, together) if together else None
     if alone is None:
         return _search_beside(given, linear) or linear
-    beside_best = _search_beside_best(given, linear, alone) if alone else None
+    fits, beside_best = alone, _search_beside_best(given, linear, alone) if alone else None
     if beside_best is None or len(beside_best.estimates) > 1:
         screened = _screened_single_fits(given, first, alone)
-        if screened and (not alone or screened[0].estimate is not alone[0].estimate):
-            beside_best = _search_beside_best(given, linear, screened) or beside_best
+        if screened and (not alone or screened[0].estimates is not alone[0].estimates):
+            fits, beside_best = screened, _search_beside_best(given, linear, screened) or beside_best
     if beside_best is not None and len(beside_best.estimates) == 1:
-        return beside_best
+        if not _several_fit_better(given, first, linear, fits[0]):
+            return beside_best
+        beside_best = None
     best = beside_best if beside_best is not None and _within_bounds(given, beside_best) else None
     best = _simpler(given, best, linear, ties=not alone)
     if best is None or best.complexity > (0, 1):
@@ -269,14 +298,14 @@ def _within_bounds(given: SearchInput, outcome: SearchOutcome) -> bool:
     return not out_of_bounds(given.measurement, outcome.estimates, outcome.residuals)
 
 
-def _strongest_single_fits(given: SearchInput, first: MeanSearch, together: list[SelectedEffect]) -> list[_SingleFit] | None:
+def _strongest_single_fits(given: SearchInput, first: MeanSearch, together: list[SelectedEffect]) -> list[_Refit] | None:
     """The effects that alone explain most, refitted without linearising, best first.
 
     Empty if no effect is strong, or none can be put into the model. None if the linearised model is kept. Either it misjudges the
     strongest effect by less than `mean.class_margin` and less than half of the log-likelihood ratio of each selected effect. Or
     it selected a single effect of the catalogue, and no effect is strong.
     """
-    found: list[_SingleFit] = []
+    found: list[_Refit] = []
     tolerance = min([thresholds().mean.class_margin, *(_ABSORBED_SHARE * each.log_likelihood_ratio for each in together)])
     leading = first.leading_effects()
     for candidate in leading:
@@ -293,7 +322,7 @@ def _strongest_single_fits(given: SearchInput, first: MeanSearch, together: list
     return _best_variants(given, first, found)
 
 
-def _screened_single_fits(given: SearchInput, first: MeanSearch, alone: list[_SingleFit]) -> list[_SingleFit]:
+def _screened_single_fits(given: SearchInput, first: MeanSearch, alone: list[_Refit]) -> list[_Refit]:
     """Refit the effects that alone leave the smallest residuals, and add the significant ones to the given fits.
 
     Returns
@@ -305,21 +334,19 @@ def _screened_single_fits(given: SearchInput, first: MeanSearch, alone: list[_Si
     refitted = [each for each in _best_variants(given, first, more) if each.is_significant(given, first)] if more else []
     if not refitted:
         return alone
-    best: dict[str, _SingleFit] = {}
+    best: dict[str, _Refit] = {}
     for each in _ranked_on_common_points([*alone, *refitted], first):
         best.setdefault(each.name, each)
     return list(best.values())
 
 
-def _single_fit(
-    given: SearchInput, first: MeanSearch, candidate: Candidate, values: FloatArray | None = None
-) -> _SingleFit | None:
+def _single_fit(given: SearchInput, first: MeanSearch, candidate: Candidate, values: FloatArray | None = None) -> _Refit | None:
     """Put one effect into the sensor model. values: (k,) its coefficients; None: those of the linearised fit."""
     (estimate,) = estimates_of(first, [first.selected_alone(candidate)])
-    return _SingleFit.of(given, first, estimate if values is None else replace(estimate, values=values))
+    return _Refit.of(given, first, [estimate if values is None else replace(estimate, values=values)])
 
 
-def _best_variants(given: SearchInput, first: MeanSearch, found: list[_SingleFit]) -> list[_SingleFit]:
+def _best_variants(given: SearchInput, first: MeanSearch, found: list[_Refit]) -> list[_Refit]:
     """The best effects, refitted to convergence, best first.
 
     The best effect is also refitted for other cameras or choices of parameters, because which one it is may not show before.
@@ -333,9 +360,9 @@ def _best_variants(given: SearchInput, first: MeanSearch, found: list[_SingleFit
     return _ranked_on_common_points([same[0], *rest], first)
 
 
-def _search_beside_best(given: SearchInput, plain: SearchOutcome, alone: list[_SingleFit]) -> SearchOutcome | None:
+def _search_beside_best(given: SearchInput, plain: SearchOutcome, alone: list[_Refit]) -> SearchOutcome | None:
     """Repeat the search beside the best of some single fits."""
-    estimate = _with_equivalence_class(alone).estimate
+    (estimate,) = _with_equivalence_class(alone).estimates
     return _search_beside(given, replace(plain, chosen=[estimate.chosen], estimates=[estimate]))
 
 
@@ -354,15 +381,16 @@ def _registered_residuals(found: Residuals, part: Residuals) -> tuple[FloatArray
     return value, used
 
 
-def _with_equivalence_class(converged: list[_SingleFit]) -> _SingleFit:
+def _with_equivalence_class(converged: list[_Refit]) -> _Refit:
     """Return the best of the refitted single effects, with the effects that cannot be told from it."""
     best, *others = converged
-    chosen = best.estimate.chosen
+    (estimate,) = best.estimates
+    chosen = estimate.chosen
     classed = _with_class(chosen, replace(chosen, score=best.score), {each.name: each.score for each in others})
-    return replace(best, estimate=replace(best.estimate, chosen=classed))
+    return replace(best, estimates=(replace(estimate, chosen=classed),))
 
 
-def _converged(given: SearchInput, first: MeanSearch, alone: _SingleFit) -> _SingleFit:
+def _converged(given: SearchInput, first: MeanSearch, alone: _Refit) -> _Refit:
     """Gauss-Newton steps until the log-likelihood rises by less than 1."""
     for _ in range(_MOST_ROUNDS):
         improved = alone.improved(given, first)
