@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
 
@@ -16,7 +17,8 @@ from pipeline.gap.naming.nonlinear_refit import (
     _best_variants,
     _gain_over,
     _ranked_on_common_points,
-    _SingleFit,
+    _Refit,
+    _several_fit_better,
     _with_equivalence_class,
 )
 from pipeline.gap.naming.search_outcome import SearchOutcome
@@ -34,11 +36,11 @@ def estimated(name: str, alike: tuple[str, ...] = (), scores: tuple[FamilyScore,
     return Estimate(SelectedEffect(candidate, alike, 0.002, 200.0, 199.0, scores), candidate, np.zeros(1), np.eye(1))
 
 
-def fit(name: str, value: list[float], used: list[bool], alike: tuple[str, ...] = ()) -> _SingleFit:
+def fit(name: str, value: list[float], used: list[bool], alike: tuple[str, ...] = ()) -> _Refit:
     """Return a fit with the given residuals; what is not used counts as 0. alike: its class in the linearised search."""
     kept, estimate = np.array(used), estimated(name, alike)
     values, absent = np.where(kept, value, 0.0), Any
-    return _SingleFit(estimate, absent, absent, values, kept, CHI2.design.log_likelihood(values, None))  # type: ignore[arg-type]
+    return _Refit((estimate,), absent, absent, values, kept, CHI2.design.log_likelihood(values, None))  # type: ignore[arg-type]
 
 
 def test_a_fit_that_leaves_out_outliers_is_not_favoured() -> None:
@@ -49,7 +51,7 @@ def test_a_fit_that_leaves_out_outliers_is_not_favoured() -> None:
     ranked = _ranked_on_common_points([leaves_out, keeps], CHI2)
     assert [each.name for each in ranked] == ["trunnion_tilt", "tilt_drift"]
     assert _gain_over(keeps, leaves_out, CHI2) == pytest.approx(1.5)
-    assert _with_equivalence_class(ranked).estimate.chosen.indistinguishable == ("tilt_drift",)
+    assert _with_equivalence_class(ranked).estimates[0].chosen.indistinguishable == ("tilt_drift",)
 
 
 def test_effects_that_leave_out_points_do_not_keep_a_better_one_from_being_refitted(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -63,7 +65,7 @@ def test_effects_that_leave_out_points_do_not_keep_a_better_one_from_being_refit
 def test_clearly_different_fits_are_no_class() -> None:
     ranked = _ranked_on_common_points([fit("a", [0.0, 5.0], [True, True]), fit("b", [0.0, 1.0], [True, True])], CHI2)
     assert [each.name for each in ranked] == ["b", "a"]
-    assert _with_equivalence_class(ranked).estimate.chosen.indistinguishable == ()
+    assert _with_equivalence_class(ranked).estimates[0].chosen.indistinguishable == ()
 
 
 @pytest.mark.parametrize(("worse", "alike"), [(3.5, ("a",)), (6.5, ())])
@@ -71,7 +73,7 @@ def test_what_the_linearised_search_could_not_tell_apart_must_differ_clearly(wor
     """Effect a stays in the class of b up to a difference of 6, and effect c, which was told apart before, up to 3."""
     away = float(np.sqrt(2 * worse))
     ranked = [fit("b", [0.0], [True], ("a",)), fit("a", [away], [True]), fit("c", [away], [True])]
-    assert _with_equivalence_class(ranked).estimate.chosen.indistinguishable == alike
+    assert _with_equivalence_class(ranked).estimates[0].chosen.indistinguishable == alike
 
 
 @pytest.mark.parametrize(("refitted", "linearised", "significant"), [(20.0, 0.0, False), (20.0, 20.0, True), (0.0, 20.0, True)])
@@ -104,3 +106,21 @@ def test_fewer_effects_are_no_alternative_if_they_leave_a_misfit_that_more_do_no
     monkeypatch.setattr(nonlinear_refit, "_within_bounds", lambda *_: True)
     nothing: Any = None
     assert nonlinear_refit._simpler(nothing, best, alone, ties=False) is (best if named == "a" else alone)
+
+
+@pytest.mark.parametrize(
+    ("left_by_one", "second_is_empirical", "better"), [(1.0, False, False), (5.0, False, True), (5.0, True, False)]
+)
+def test_one_effect_does_not_stand_for_two_that_explain_significantly_more(
+    monkeypatch: pytest.MonkeyPatch, left_by_one: float, second_is_empirical: bool, better: bool
+) -> None:
+    """The two leave no residual, and the second one costs 1; a score of 10 is significant, and residuals of 5 cost 12.5."""
+    both = [estimated("a"), estimated("b")]
+    second = replace(both[1], candidate=replace(both[1].candidate, empirical=second_is_empirical))
+    together = replace(fit("a", [0.0], [True]), estimates=(both[0], second))
+    monkeypatch.setattr(nonlinear_refit._Refit, "of", lambda *_: together)
+    monkeypatch.setattr(nonlinear_refit, "_converged", lambda _given, _first, each: each)
+    search: Any = SimpleNamespace(design=CHI2.design, p_value=lambda score: 0.002 if score > 10 else 0.5)
+    given: Any = None
+    found = _several_fit_better(given, search, outcome([both[0], second]), fit("c", [left_by_one], [True]))
+    assert found == better

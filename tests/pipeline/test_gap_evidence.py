@@ -20,8 +20,7 @@ from pipeline.formats.measurements.measurement import read_measurement
 from pipeline.gap.mean.candidates import Candidate
 from pipeline.gap.mean.nonparametric_terms import SPATIAL_NULL
 from pipeline.gap.mean.selection import EffectSet, FamilyScore, ForwardSelection
-from pipeline.gap.naming.named_effects import NamedEffect
-from pipeline.gap.naming.selection_notes import _note_pairs
+from pipeline.gap.naming.named_effects import Estimate, NamedEffect, effect_from_estimate
 from pipeline.gap.naming.selection_passes import subsample
 from pipeline.gap.naming.validation_scores import (
     ValidatedEffects,
@@ -317,11 +316,13 @@ def test_two_effects_that_explain_more_than_one_cannot_be_told_from_it(pair: flo
     """The one effect, which scores 50, is chosen because the gain of 2 by the pair is not significant."""
     (only,) = ForwardSelection(_Turns(pair)).select()[0]
     assert only.candidate.name == "camera_kappa"
-    assert only.indistinguishable == only.replacing_pair == alike
-    estimate: Any = SimpleNamespace(candidate=only.candidate, chosen=only)
+    assert only.indistinguishable == ()
+    assert only.replacing_pair == alike
     part: Any = SimpleNamespace(sensor="stereo")
-    said = "stereo.camera_omega and stereo.camera_phi together explain the residuals as well as stereo.camera_kappa"
-    assert _note_pairs([estimate], part) == ([said] if alike else [])
+    candidate = replace(only.candidate, matrix=np.zeros((1, 0)))
+    named = effect_from_estimate(Estimate(only, candidate, np.zeros(0), np.zeros((0, 0))), part)
+    assert named.to_dict()["cannot_be_told_from"] == [f"stereo.{name}" for name in alike]
+    assert named.alternatives == (["stereo.camera_omega with stereo.camera_phi"] if alike else [])
 
 
 @pytest.mark.parametrize(("places", "named"), [(5.0, {"collimation", "range_scale"}), (75.0, set())])

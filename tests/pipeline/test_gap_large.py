@@ -124,7 +124,7 @@ def test_the_class_of_an_effect_taken_exactly_is_by_exact_likelihoods(
     for margin in (0.0, 1e9):
         monkeypatch.setattr(nonlinear_refit, "equivalence_margin", lambda _, margin=margin: margin)
         one = _with_equivalence_class(_strongest_single_fits(points, first, first.select()[0]))
-        classes[margin] = set(effect_from_estimate(one.estimate, points.part).indistinguishable)
+        classes[margin] = set(effect_from_estimate(one.estimates[0], points.part).indistinguishable)
     exactly = classes[1e9] - classes[0.0]
     assert len(exactly) == 2
     assert f"stereo.{one.name}" not in classes[1e9]
@@ -143,13 +143,10 @@ def test_slopes_do_not_serve_where_what_they_miss_is_as_much_as_something_gains(
     (leading, *_) = _strongest_single_fits(points, first, chosen)
     # beside other effects, the points that the refit leaves out count too
     one, two = (
-        abs(
-            leading.log_likelihood
-            - first.design.log_likelihood(np.where(used, points.part.value, 0.0), [leading.estimate.candidate])
-        )
+        abs(leading.log_likelihood - first.design.log_likelihood(np.where(used, points.part.value, 0.0), leading.candidates))
         for used in (leading.used, np.ones_like(leading.used))
     )
-    monkeypatch.setattr(first, "leading_effects", lambda: [leading.estimate.candidate])
+    monkeypatch.setattr(first, "leading_effects", lambda: leading.candidates)
     monkeypatch.setattr(nonlinear_refit, "_single_fit", lambda *_: leading)
     monkeypatch.setattr(nonlinear_refit, "_best_variants", lambda *_: [leading])
 

@@ -61,14 +61,14 @@ class SelectedEffect:
     Attributes
     ----------
     candidate : The best variant of the error, for example with its best period.
-    indistinguishable : Names of the effects that would score as well in its place, `replacing_pair` included.
+    indistinguishable : Names of the effects that would score as well in its place.
     p_value : Probability that the best of all candidates scores as much by chance; so it is corrected for multiple testing.
     log_likelihood_ratio : Log-likelihood with the error minus that without it; the other selected effects are in the model
         both times.
     score : Log-likelihood ratio minus a penalty for what is fitted.
     family_scores : Scores of all candidates in place of this error, with the other selected effects in the model. If the error
         is a non-parametric term, no other effect is in the model.
-    replacing_pair : Names of two effects that would score higher in its place, but only together; empty if there are none.
+    replacing_pair : Names of two effects that would score higher in its place together; empty if there are none.
     """
 
     candidate: Candidate
@@ -276,7 +276,7 @@ class ForwardSelection:
         alike = [each.name for each in beside if each is not mine and each.score > mine.score - margin]
         alike += _replacements(names | {item.name}, item.name, margin, scores)
         pair = _replacing_pair(names | {item.name}, item.name, scores)
-        return SelectedEffect(item.candidate, tuple(dict.fromkeys([*alike, *pair])), p_value, ratio, mine.score, tried, pair)
+        return SelectedEffect(item.candidate, tuple(dict.fromkeys(alike)), p_value, ratio, mine.score, tried, pair)
 
     def _significant(self, score: float) -> bool:
         """Tell whether a score is significant."""

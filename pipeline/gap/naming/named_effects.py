@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -58,6 +58,8 @@ class NamedEffect:
     p_value : p-value from the simulated null distribution; None if none was simulated.
     gain : log-likelihood ratio of the models with and without it, on validation points once it was validated.
     split_by : further measurement that would tell it from those in `indistinguishable`, in words; "" if there are none.
+    replacing_pair : names of two effects that explain the measurement as well, but only together; they are among the
+        indistinguishable ones. Empty if there are none.
     """
 
     name: str
@@ -68,6 +70,13 @@ class NamedEffect:
     p_value: float | None
     gain: float
     split_by: str = ""
+    replacing_pair: tuple[str, ...] = ()
+
+    @property
+    def alternatives(self) -> list[str]:
+        """Explanations that fit this measurement as well, in words: the name of an effect, or of one "with" another."""
+        single = [name for name in self.indistinguishable if name not in self.replacing_pair]
+        return [*single, *filter(None, [" with ".join(self.replacing_pair)])]
 
     @property
     def effect(self) -> type[Effect]:
@@ -298,7 +307,9 @@ def effect_from_estimate(found: Estimate, part: Residuals) -> NamedEffect:
         return _named(part.sensor, entry, {}, ratio, empirical=True, p_value=p_value)
     entry = {"name": candidate.name, **candidate.fixed, **candidate.parameters(found.values)}
     std = _standard_deviations(candidate, found.values, found.covariance)
-    return _named(part.sensor, entry, std, ratio, alike=item.indistinguishable, p_value=p_value)
+    alike = dict.fromkeys([*item.indistinguishable, *item.replacing_pair])
+    named = _named(part.sensor, entry, std, ratio, alike=alike, p_value=p_value)
+    return replace(named, replacing_pair=tuple(f"{part.sensor}.{name}" for name in item.replacing_pair))
 
 
 def _standard_deviations(candidate: Candidate, values: FloatArray, covariance: FloatArray) -> dict[str, float]:

@@ -269,7 +269,7 @@ def _with_class(chosen: SelectedEffect, refitted: SelectedEffect, scores: Mappin
     margin, before = equivalence_margin(refitted.log_likelihood_ratio), set(chosen.indistinguishable)
     near = {name for name, score in scores.items() if score > refitted.score - (1 + (name in before)) * margin}
     alike = (near | (before - set(scores))) - {chosen.candidate.name}
-    return replace(chosen, indistinguishable=tuple(sorted(alike)))
+    return replace(chosen, indistinguishable=tuple(sorted(alike)), replacing_pair=())
 
 
 def _simpler(given: SearchInput, best: SearchOutcome | None, other: SearchOutcome, ties: bool) -> SearchOutcome | None:

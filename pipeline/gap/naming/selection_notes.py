@@ -27,18 +27,12 @@ def note_left_out(excluded: frozenset[tuple[str, bool]]) -> list[str]:
 def notes_on_outcome(found: SearchOutcome, part: Residuals) -> list[str]:
     """Return remarks for the report on an explanation of residuals, and on a misfit that it leaves.
 
-    They tell of terms that repeat after a few scan lines, of two effects that may replace one, of waves that belong to the
-    reference, and of the candidate that is most similar to a misfit where nothing was accepted.
+    They tell of terms that repeat after a few scan lines, of waves that belong to the reference, and of the candidate that is
+    most similar to a misfit where nothing was accepted.
 
     found: the explanation. part: the residuals of the n points that were searched.
     """
-    estimates = found.estimates
-    return [
-        *_note_repetition(estimates),
-        *_note_pairs(estimates, part),
-        *_note_oblique_waves(found),
-        *_note_most_similar(found, part),
-    ]
+    return [*_note_repetition(found.estimates), *_note_oblique_waves(found), *_note_most_similar(found, part)]
 
 
 def _note_repetition(estimates: list[Estimate]) -> list[str]:
@@ -48,13 +42,6 @@ def _note_repetition(estimates: list[Estimate]) -> list[str]:
         f"the empirical term repeats after exactly {each} lines: think of the facets of a mirror, or of a read-out in blocks"
         for each in lines
     ]
-
-
-def _note_pairs(estimates: list[Estimate], part: Residuals) -> list[str]:
-    """Return remarks for the report on effects that two others explain as well together."""
-    found = [(each.candidate.name, pair) for each in estimates if (pair := each.chosen.replacing_pair)]
-    prefix = part.sensor
-    return [f"{prefix}.{a} and {prefix}.{b} together explain the residuals as well as {prefix}.{name}" for name, (a, b) in found]
 
 
 def _note_most_similar(found: SearchOutcome, part: Residuals) -> list[str]:

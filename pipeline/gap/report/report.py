@@ -126,7 +126,7 @@ def summarise(found: GapDiagnosis) -> str:
         if found.verdict == "insufficient_data":
             lines += [f"  {found.remaining['note']}", f"  to measure: {_describe_needed_data(found)}"]
         for effect in found.effects:
-            alike = f"; cannot be told from {', '.join(effect.indistinguishable)}" if effect.indistinguishable else ""
+            alike = f"; cannot be told from {', '.join(effect.alternatives)}" if effect.indistinguishable else ""
             lines.append(f"  {effect.name} ({format_parameters(effect)}){alike}")
         if found.changes:
             regions = "1 region" if len(found.changes) == 1 else f"{len(found.changes)} regions"

@@ -41,7 +41,7 @@ _COVARIATES = {
 
 def title(found: GapDiagnosis) -> str:
     """Return the outcome of a diagnosis as the headline of the report, such as "Missing: tls.range_offset"."""
-    names = [" or ".join([effect.name, *effect.indistinguishable]) for effect in found.effects if effect.kind == "physical"]
+    names = [" or ".join([effect.name, *effect.alternatives]) for effect in found.effects if effect.kind == "physical"]
     match found.verdict:
         case "no_gap" | "unknown" if found.evidence.only_noise_too_large(found.effects):
             return "No missing effect was found, but the model is too noisy"
@@ -258,7 +258,7 @@ def _describe_alternatives(effect: NamedEffect) -> str:
     """Sentence on the effects from which a named one cannot be told, after a space; "" if there are none."""
     if not effect.indistinguishable:
         return ""
-    return f" It cannot be told from {', '.join(effect.indistinguishable)}; to separate them: {effect.split_by}."
+    return f" It cannot be told from {', '.join(effect.alternatives)}; to separate them: {effect.split_by}."
 
 
 def _describe_empirical(effect: NamedEffect) -> str:
