@@ -16,9 +16,9 @@ from pipeline.gap.naming.named_effects import Estimate
 from pipeline.gap.naming.nonlinear_refit import (
     _best_variants,
     _gain_over,
+    _one_suffices,
     _ranked_on_common_points,
     _Refit,
-    _several_fit_better,
     _with_equivalence_class,
 )
 from pipeline.gap.naming.search_outcome import SearchOutcome
@@ -109,18 +109,29 @@ def test_fewer_effects_are_no_alternative_if_they_leave_a_misfit_that_more_do_no
 
 
 @pytest.mark.parametrize(
-    ("left_by_one", "second_is_empirical", "better"), [(1.0, False, False), (5.0, False, True), (5.0, True, False)]
+    ("left_by_one", "p_value", "strong", "second_is_empirical", "suffices"),
+    [
+        (1.0, 0.4, True, False, True),
+        (5.0, 0.4, True, False, False),
+        (5.0, 0.4, False, False, True),
+        (1.0, 0.002, False, False, False),
+        (5.0, 0.002, True, True, True),
+    ],
 )
-def test_one_effect_does_not_stand_for_two_that_explain_significantly_more(
-    monkeypatch: pytest.MonkeyPatch, left_by_one: float, second_is_empirical: bool, better: bool
+def test_one_effect_stands_for_two_only_if_these_do_not_explain_significantly_more(
+    monkeypatch: pytest.MonkeyPatch, left_by_one: float, p_value: float, strong: bool, second_is_empirical: bool, suffices: bool
 ) -> None:
-    """The two leave no residual, and the second one costs 1; a score of 10 is significant, and residuals of 5 cost 12.5."""
+    """The two leave neither residuals nor a misfit, and the second one costs 1.
+
+    A score of 10 is significant, and residuals of 5 cost 12.5. p_value: of the misfit that the one effect leaves.
+    """
     both = [estimated("a"), estimated("b")]
     second = replace(both[1], candidate=replace(both[1].candidate, empirical=second_is_empirical))
     together = replace(fit("a", [0.0], [True]), estimates=(both[0], second))
     monkeypatch.setattr(nonlinear_refit._Refit, "of", lambda *_: together)
     monkeypatch.setattr(nonlinear_refit, "_converged", lambda _given, _first, each: each)
     search: Any = SimpleNamespace(design=CHI2.design, p_value=lambda score: 0.002 if score > 10 else 0.5)
+    one, alone = outcome([estimated("c")], p_value=p_value), fit("c", [left_by_one], [True])
     given: Any = None
-    found = _several_fit_better(given, search, outcome([both[0], second]), fit("c", [left_by_one], [True]))
-    assert found == better
+    linear = outcome([both[0], second], p_value=0.4)
+    assert _one_suffices(given, search, linear, one, alone if strong else None) == suffices

@@ -68,7 +68,8 @@ class SelectedEffect:
     score : Log-likelihood ratio minus a penalty for what is fitted.
     family_scores : Scores of all candidates in place of this error, with the other selected effects in the model. If the error
         is a non-parametric term, no other effect is in the model.
-    replacing_pair : Names of two effects that would score higher in its place together; empty if there are none.
+    replacing_pair : Names of two effects that would score as well together, in its place or in that of it and another selected
+        effect; empty if there are none.
     """
 
     candidate: Candidate
@@ -132,12 +133,16 @@ def _replacements(names: set[str], name: str, margin: float, scores: SetScores) 
     return [other for each in sorted(as_good, key=lambda each: -scores[each]) for other in each - others if other != name]
 
 
-def _replacing_pair(names: set[str], name: str, scores: SetScores) -> tuple[str, ...]:
-    """Return the two effects that best replace `name` in the set `names`; empty unless the joint score rises with them."""
-    others, least = names - {name}, scores.get(frozenset(names), math.inf)
-    larger = [each for each in scores if others < each and name not in each and len(each) == len(names) + 1]
-    best = max(larger, key=lambda each: scores[each], default=None)
-    return () if best is None or scores[best] <= least else tuple(sorted(best - others))
+def _replacing_pair(names: set[str], name: str, margin: float, scores: SetScores) -> tuple[str, ...]:
+    """Return the two effects that best replace `name`, or `name` and another effect of the set `names`; empty if none do.
+
+    The joint score must be nearly the same for as many effects, and higher for one effect more.
+    """
+    joint = scores.get(frozenset(names), math.inf)
+    least = {len(names): joint - margin, len(names) + 1: joint}
+    sets = (each for each in scores if name not in each and len(each - names) == 2)
+    as_good = [each for each in sets if scores[each] > least.get(len(each), math.inf)]
+    return tuple(sorted(max(as_good, key=lambda each: scores[each]) - names)) if as_good else ()
 
 
 def _least_nonparametric_score() -> float:
@@ -275,7 +280,7 @@ class ForwardSelection:
         margin = equivalence_margin(ratio)
         alike = [each.name for each in beside if each is not mine and each.score > mine.score - margin]
         alike += _replacements(names | {item.name}, item.name, margin, scores)
-        pair = _replacing_pair(names | {item.name}, item.name, scores)
+        pair = _replacing_pair(names | {item.name}, item.name, margin, scores)
         return SelectedEffect(item.candidate, tuple(dict.fromkeys(alike)), p_value, ratio, mine.score, tried, pair)
 
     def _significant(self, score: float) -> bool:

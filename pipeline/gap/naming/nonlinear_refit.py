@@ -122,18 +122,26 @@ def _gain_over(later: _Refit, earlier: _Refit, first: MeanSearch) -> float:
     return after.log_likelihood - before.log_likelihood
 
 
-def _several_fit_better(given: SearchInput, first: MeanSearch, linear: SearchOutcome, one: _Refit) -> bool:
-    """Tell whether the effects that the linearised search selected explain significantly more together than one effect.
+def _one_suffices(
+    given: SearchInput, first: MeanSearch, linear: SearchOutcome, one: SearchOutcome, strong: _Refit | None
+) -> bool:
+    """Tell whether one effect explains the residuals as well as the several that the linearised search selected.
 
-    All are compared without linearising.
+    It must not leave a misfit where these leave none. If it is strong, it is also compared with these without linearising: what
+    each further effect adds on average must not be significant.
+
+    one: the explanation by one effect; strong: the refit of that effect, None if no effect is strong.
     """
     if len(linear.estimates) < 2 or any(each.candidate.empirical for each in linear.estimates):
+        return True
+    if one.leaves_more_misfit_than(linear):
         return False
-    start = _Refit.of(given, first, linear.estimates)
-    if start is None:
-        return False
-    together, alone = _on_common_points([_converged(given, first, start), one], first)
-    return first.p_value(together.score - alone.score) <= thresholds().mean.significance
+    several = None if strong is None else _Refit.of(given, first, linear.estimates)
+    if strong is None or several is None:
+        return True
+    together, alone = _on_common_points([_converged(given, first, several), strong], first)
+    gain = (together.score - alone.score) / (len(together.estimates) - 1)
+    return first.p_value(gain) > thresholds().mean.significance
 
 
 def select_and_refit(given: SearchInput, first: MeanSearch) -> SearchOutcome:
@@ -142,8 +150,8 @@ def select_and_refit(given: SearchInput, first: MeanSearch) -> SearchOutcome:
     The linearised model is inexact for a large effect, and forward selection then adds spurious effects that absorb the
     linearisation error. The strongest effects are therefore refitted alone without linearising, and the selection is repeated
     beside the best one. If that still needs several effects, or if none is strong, each effect is tried alone
-    (`screen_effects`). If several are needed then too, the selection is relinearised: repeated with
-    the derivatives at the model that holds its effects.
+    (`screen_effects`). If several are needed then too, or if one explains significantly less, the selection is relinearised:
+    repeated with the derivatives at the model that holds its effects.
 
     Parameters
     ----------
@@ -170,7 +178,7 @@ def _selected_and_refitted(given: SearchInput, first: MeanSearch) -> SearchOutco
         if screened and (not alone or screened[0].estimates is not alone[0].estimates):
             fits, beside_best = screened, _search_beside_best(given, linear, screened) or beside_best
     if beside_best is not None and len(beside_best.estimates) == 1:
-        if not _several_fit_better(given, first, linear, fits[0]):
+        if _one_suffices(given, first, linear, beside_best, fits[0] if alone else None):
             return beside_best
         beside_best = None
     best = beside_best if beside_best is not None and _within_bounds(given, beside_best) else None
