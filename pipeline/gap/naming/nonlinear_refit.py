@@ -11,7 +11,7 @@ from pipeline.formats.measurements.measurement import Measurement
 from pipeline.gap.mean.candidates import Candidate
 from pipeline.gap.mean.search import MeanSearch
 from pipeline.gap.mean.selection import FamilyScore, ForwardSelection, SelectedEffect
-from pipeline.gap.naming.candidate_families import candidate_families, catalogue_families
+from pipeline.gap.naming.candidate_families import catalogue_families
 from pipeline.gap.naming.effect_screening import gauss_newton_step, screen_effects
 from pipeline.gap.naming.named_effects import Estimate, out_of_bounds
 from pipeline.gap.naming.search_beside_effects import (
@@ -19,11 +19,10 @@ from pipeline.gap.naming.search_beside_effects import (
     estimates_of,
     recomputed,
     repeat_search,
+    search_at_fit,
     too_few_left,
-    with_variance_refitted,
 )
 from pipeline.gap.naming.search_outcome import SearchInput, SearchOutcome
-from pipeline.gap.naming.search_residuals import with_added_variance
 from pipeline.gap.residuals.alignment import at_points_of, fit_pose_robustly
 from pipeline.gap.residuals.residuals import BoolArray, Residuals
 from pipeline.gap.thresholds import equivalence_margin, thresholds
@@ -207,43 +206,12 @@ def _selected_at_fit(given: SearchInput, found: SearchOutcome) -> SearchOutcome 
 
     None if no effect of the catalogue was selected, if one is out of bounds, or if too few rays meet the reference.
     """
-    at_fit = _search_at_fit(given, found)
+    at_fit = search_at_fit(given, _physical(found)) if _within_bounds(given, found) else None
     if at_fit is None:
         return None
     search, left, _ = at_fit
     together, tried = search.select()
     return SearchOutcome(together, estimates_of(search, together), search, left, together, tried)
-
-
-def _search_at_fit(given: SearchInput, found: SearchOutcome) -> tuple[MeanSearch, Residuals, list[Candidate]] | None:
-    """Prepare a search with the derivatives of the residuals taken at the model that holds the effects of an explanation.
-
-    What these explain is added back to the residuals, so that the search can select all of them again.
-
-    Returns
-    -------
-    search : the search.
-    left : the residuals that it explains.
-    known : the effects of the explanation as regression terms of this search, without empirical terms.
-
-    None if the explanation has no effect of the catalogue, if one is out of bounds, or if too few rays meet the reference.
-    """
-    physical = [each for each in found.estimates if not each.candidate.empirical]
-    if not physical or not _within_bounds(given, found):
-        return None
-    measurement, moved, _ = aligned_with_estimates(given, physical)
-    at = with_added_variance(at_points_of(moved, given.part), given.added)
-    if too_few_left(given, at):
-        return None
-    catalogue = catalogue_families(measurement, at)
-    known = [recomputed(each.candidate, catalogue) for each in physical]
-    pairs = zip(known, physical, strict=True)
-    explained = sum(term.columns @ each.values[: term.columns.shape[1]] for term, each in pairs)
-    allowed = {(family.name, family.empirical) for family in given.families}
-    families = [each for each in candidate_families(measurement, at, catalogue) if (each.name, each.empirical) in allowed]
-    left = replace(at, value=at.value + explained)
-    search = MeanSearch(replace(with_variance_refitted(given, at), value=left.value), families, given.random.child("again"))
-    return search, left, known
 
 
 def _with_classes_at_fit(given: SearchInput, found: SearchOutcome) -> SearchOutcome:
@@ -253,7 +221,7 @@ def _with_classes_at_fit(given: SearchInput, found: SearchOutcome) -> SearchOutc
     """
     if len(found.estimates) <= len(found.chosen) or any(each.candidate.empirical for each in found.estimates):
         return found
-    at_fit = _search_at_fit(given, found)
+    at_fit = search_at_fit(given, found.estimates) if _within_bounds(given, found) else None
     if at_fit is None:
         return found
     search, _, known = at_fit
@@ -299,6 +267,11 @@ def _simpler(given: SearchInput, best: SearchOutcome | None, other: SearchOutcom
     if best is not None and other.leaves_more_misfit_than(best):
         return best
     return other if wins(other.complexity) and _within_bounds(given, other) else best
+
+
+def _physical(outcome: SearchOutcome) -> list[Estimate]:
+    """The effects of an explanation without its empirical terms."""
+    return [each for each in outcome.estimates if not each.candidate.empirical]
 
 
 def _within_bounds(given: SearchInput, outcome: SearchOutcome) -> bool:
@@ -413,7 +386,5 @@ def _search_beside(given: SearchInput, chosen: SearchOutcome) -> SearchOutcome |
 
     None if none was selected, if one is out of bounds, or if too few rays meet the reference.
     """
-    physical = [each for each in chosen.estimates if not each.candidate.empirical]
-    if not physical or out_of_bounds(given.measurement, chosen.estimates, chosen.residuals):
-        return None
-    return repeat_search(given, chosen, physical)
+    physical = _physical(chosen)
+    return repeat_search(given, chosen, physical) if physical and _within_bounds(given, chosen) else None

@@ -33,14 +33,12 @@ def repeat_search(given: SearchInput, before: SearchOutcome, known_effects: list
     SearchOutcome or None : the effects that are in the model and those that were found beside them; None if too few rays meet
         the reference with the effects.
     """
-    measurement, found, _ = aligned_with_estimates(given, known_effects)
-    at = with_added_variance(at_points_of(found, given.part), given.added)
-    if too_few_left(given, at):
+    there = _with_in_model(given, known_effects)
+    if there is None:
         return None
-    catalogue = catalogue_families(measurement, at)
-    allowed = {(family.name, family.empirical) for family in given.families}
-    allowed -= {(each.candidate.name, False) for each in known_effects}
-    families = [each for each in candidate_families(measurement, at, catalogue) if (each.name, each.empirical) in allowed]
+    at, catalogue, families = there
+    names = {each.candidate.name for each in known_effects}
+    families = [each for each in families if each.empirical or each.name not in names]
     known = [replace(each, candidate=recomputed(each.candidate, catalogue)) for each in known_effects]
     periodic = [(PERIODIC[name], each.candidate) for each in known if (name := each.candidate.name) in PERIODIC]
     families += [harmonics(covariate, sine, last) for covariate, sine in periodic for last in HARMONIC_ORDERS]
@@ -62,6 +60,59 @@ def repeat_search(given: SearchInput, before: SearchOutcome, known_effects: list
         kept.append(replace(each, values=each.values + fit.coefficients[place], covariance=fit.covariance[place, place]))
     estimates = _merge_sines_with_overtones([*kept, *estimates_of(search, chosen)])
     return SearchOutcome(before.chosen, estimates, search, at, chosen, tried)
+
+
+def search_at_fit(given: SearchInput, effects: list[Estimate]) -> tuple[MeanSearch, Residuals, list[Candidate]] | None:
+    """Prepare a search with the derivatives of the residuals taken at the model that holds some effects.
+
+    What these explain is added back to the residuals, so that the search can select all of them again.
+
+    Parameters
+    ----------
+    given : input of the searches.
+    effects : effects of the catalogue, with the coefficients that they get in the model.
+
+    Returns
+    -------
+    search : the search.
+    left : the residuals that it explains.
+    known : the effects as regression terms of this search.
+
+    None if there are no effects, or if too few rays meet the reference with them.
+    """
+    there = _with_in_model(given, effects) if effects else None
+    if there is None:
+        return None
+    at, catalogue, families = there
+    known = [recomputed(each.candidate, catalogue) for each in effects]
+    pairs = zip(known, effects, strict=True)
+    left = replace(at, value=at.value + sum(term.columns @ each.values[: term.columns.shape[1]] for term, each in pairs))
+    search = MeanSearch(replace(with_variance_refitted(given, at), value=left.value), families, given.random.child("again"))
+    return search, left, known
+
+
+def _with_in_model(
+    given: SearchInput, effects: list[Estimate]
+) -> tuple[Residuals, list[Candidate | SineGrid], list[Candidate | SineGrid]] | None:
+    """Put effects into the model; None if too few rays meet the reference with them.
+
+    Returns
+    -------
+    at : residuals with the effects in the model.
+    catalogue : all effects of the catalogue as regression terms there.
+    families : all candidates there that are to be tried.
+    """
+    measurement, found, _ = aligned_with_estimates(given, effects)
+    at = with_added_variance(at_points_of(found, given.part), given.added)
+    if too_few_left(given, at):
+        return None
+    catalogue = catalogue_families(measurement, at)
+    allowed = {(family.name, family.empirical) for family in given.families}
+    return (
+        at,
+        catalogue,
+        [each for each in candidate_families(measurement, at, catalogue) if (each.name, each.empirical) in allowed],
+    )
 
 
 def estimates_of(search: MeanSearch, chosen: list[SelectedEffect]) -> list[Estimate]:
