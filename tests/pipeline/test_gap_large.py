@@ -27,9 +27,9 @@ from pipeline.gap.naming.named_effects import NamedEffect, effect_from_estimate
 from pipeline.gap.naming.nonlinear_refit import (
     _screened_single_fits,
     _strongest_single_fits,
-    _with_classes_at_fit,
     _with_equivalence_class,
     select_and_refit,
+    with_classes_at_fit,
 )
 from pipeline.gap.naming.search_outcome import SearchInput, SearchOutcome
 from pipeline.gap.naming.search_residuals import with_fitted_variance
@@ -217,12 +217,12 @@ def test_an_effect_gets_its_class_beside_those_that_were_found_later(
     first = MeanSearch(with_fitted_variance(points.part, [], 1.0), points.families, KeyedRandom(1))
     found, earlier = select_and_refit(points, first), ("camera_kappa", "camera_shift")
     before = [replace(each, chosen=replace(each.chosen, indistinguishable=earlier)) for each in found.estimates]
-    found_later = _with_classes_at_fit(points, replace(found, chosen=found.chosen[:1], estimates=before)).estimates
+    found_later = with_classes_at_fit(points, replace(found, chosen=found.chosen[:1], estimates=before)).estimates
     alike = {each.candidate.name: {each.candidate.name, *each.chosen.indistinguishable} for each in found_later}
     assert alike.pop("focal_length") == {"focal_length"}
     assert list(alike.values()) == [{"camera_kappa", "affinity_skew"}]
     found_at_once = replace(found, estimates=before)
-    assert _with_classes_at_fit(points, found_at_once) is found_at_once
+    assert with_classes_at_fit(points, found_at_once) is found_at_once
 
 
 @pytest.mark.parametrize(

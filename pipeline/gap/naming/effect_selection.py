@@ -28,7 +28,7 @@ from pipeline.gap.naming.named_effects import (
     out_of_bounds,
     within_bounds,
 )
-from pipeline.gap.naming.nonlinear_refit import select_and_refit
+from pipeline.gap.naming.nonlinear_refit import select_and_refit, with_classes_at_fit
 from pipeline.gap.naming.search_beside_effects import repeat_search
 from pipeline.gap.naming.search_outcome import SearchInput, SearchOutcome
 from pipeline.gap.naming.search_residuals import with_added_variance, with_fitted_variance
@@ -175,6 +175,7 @@ def select_effects(given: SelectionInput) -> tuple[list[NamedEffect], SelectionR
             return select_effects(replace(given, grid_noise=refound))
     if wrong := (wrong | noise.implausible(measurement)) - given.excluded:
         return select_effects(given.without(wrong))
+    found = with_classes_at_fit(search, found)
     systematic = [effect_from_estimate(each, found.residuals) for each in found.estimates]
     result = _result(given, search, first, found, noise, left, frozenset(item.name for item in systematic), apart.locking)
     return [*apart.named, *systematic, *(effect_from_variance(each, part.sensor) for each in noise.terms)], result

@@ -161,11 +161,6 @@ def select_and_refit(given: SearchInput, first: MeanSearch) -> SearchOutcome:
     -------
     SearchOutcome : the explanation with the fewest empirical terms, and of these the one with the fewest effects.
     """
-    return _with_classes_at_fit(given, _selected_and_refitted(given, first))
-
-
-def _selected_and_refitted(given: SearchInput, first: MeanSearch) -> SearchOutcome:
-    """Select the effects, as `select_and_refit` does, with the equivalence classes of the searches that found them."""
     together, tried = first.select()
     linear = SearchOutcome(together, estimates_of(first, together), first, given.part, together, tried)
     alone = _strongest_single_fits(given, first, together) if together else None
@@ -214,10 +209,13 @@ def _selected_at_fit(given: SearchInput, found: SearchOutcome) -> SearchOutcome 
     return SearchOutcome(together, estimates_of(search, together), search, left, together, tried)
 
 
-def _with_classes_at_fit(given: SearchInput, found: SearchOutcome) -> SearchOutcome:
-    """Find the equivalence classes again if the second search added effects, because those of the first search lack these.
+def with_classes_at_fit(given: SearchInput, found: SearchOutcome) -> SearchOutcome:
+    """Find the effects from which those of an explanation cannot be told (equivalence classes), with all of them in the model.
 
-    An explanation with an empirical term keeps its classes, and so does one that cannot be put into the model.
+    The classes of the first search lack the effects that the second one found. Without such effects the classes stay as they are.
+    They also stay if the explanation has an empirical term, or cannot be put into the model.
+
+    given : input of the searches. found : the explanation.
     """
     if len(found.estimates) <= len(found.chosen) or any(each.candidate.empirical for each in found.estimates):
         return found
