@@ -331,7 +331,7 @@ def verdicts() -> dict[str, Verdict]:
             "An effect of the catalogue explains the disagreement, but other effects explain it about as well. Their score, a "
             "penalised log-likelihood, is within 3 of the best one, which is a factor of 20 in likelihood. "
             "`cannot_be_told_from` in gap.json lists these effects. It also lists the best two that explain it as well "
-            'together; the report joins their names by "with".',
+            'together; the report joins their names by "together with".',
             "Make the measurement that `split_by` in gap.json names. `scarpsim gap --identifiability` shows what would separate "
             "the effects at your site. You can use model_after.yaml for surveys of this wall from this place, whichever effect "
             "is true. Elsewhere it may be wrong.",

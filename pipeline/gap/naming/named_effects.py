@@ -74,9 +74,9 @@ class NamedEffect:
 
     @property
     def alternatives(self) -> list[str]:
-        """Explanations that fit this measurement as well, in words: the name of an effect, or of one "with" another."""
+        """Explanations that fit this measurement as well, in words: an effect's name, or two joined by "together with"."""
         single = [name for name in self.indistinguishable if name not in self.replacing_pair]
-        return [*single, *filter(None, [" with ".join(self.replacing_pair)])]
+        return [*single, *filter(None, [" together with ".join(self.replacing_pair)])]
 
     @property
     def effect(self) -> type[Effect]:
