@@ -80,7 +80,7 @@ def _changes(acts: list[StoredCase], name: str, usual: dict[StoredCase, Json | N
 
 
 def page(results: Json, deleted: Json, command: str) -> str:
-    """Return the page in Markdown. deleted: results of the earlier run."""
+    """Return the page in Markdown. deleted: results of the earlier run, which has the thresholds that were then deleted."""
     now = {f"{group}.{name}" for group, values in Thresholds().model_dump().items() for name in values}
     rows = {key: row for key, row in deleted["thresholds"].items() if key not in now}
     return _PAGE.format(
@@ -121,7 +121,7 @@ def _steps(steps: Json) -> str:
 
 
 def _merged(thresholds: Json) -> str:
-    """Return a table of values of similar thresholds that were tried."""
+    """Return a table of thresholds that were given the value of a similar one, and of the answers that this changed."""
     lines = [
         "| threshold | value | tried | acts | diagnosed | other answer | became wrong | became right |",
         "|---|---|---|---|---|---|---|---|",

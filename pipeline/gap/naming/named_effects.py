@@ -58,8 +58,8 @@ class NamedEffect:
     p_value : p-value from the simulated null distribution; None if none was simulated.
     gain : log-likelihood ratio of the models with and without it, on validation points once it was validated.
     split_by : further measurement that would tell it from those in `indistinguishable`, in words; "" if there are none.
-    replacing_pair : names of two effects that explain the measurement as well, but only together; they are among the
-        indistinguishable ones. Empty if there are none.
+    replacing_pair : names of two effects that together explain the measurement as well, in place of this one, or of this one
+        and another named one; they are among the indistinguishable ones. Empty if there are none.
     """
 
     name: str

@@ -37,7 +37,7 @@ _ABSORBED_SHARE = 0.5
 
 @dataclass(frozen=True)
 class _Refit:
-    """One or more effects in the model, without linearising.
+    """Fit of one or more effects whose residuals come from the full sensor model, not from its derivatives.
 
     estimates: the effects; residuals, measurement: with them in the model, at the estimated pose; value: (n,) registered
     residuals of all points, 0 where a point is not used; used: (n,) points that are used; log_likelihood: of these points.

@@ -63,7 +63,7 @@ def repeat_search(given: SearchInput, before: SearchOutcome, known_effects: list
 
 
 def search_at_fit(given: SearchInput, effects: list[Estimate]) -> tuple[MeanSearch, Residuals, list[Candidate]] | None:
-    """Prepare a search with the derivatives of the residuals taken at the model that holds some effects.
+    """Prepare a search in which the derivatives of the residuals are those of a sensor model that has some effects.
 
     What these explain is added back to the residuals, so that the search can select all of them again.
 
