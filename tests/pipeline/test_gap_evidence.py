@@ -322,7 +322,11 @@ def test_two_effects_that_explain_more_than_one_cannot_be_told_from_it(pair: flo
     candidate = replace(only.candidate, matrix=np.zeros((1, 0)))
     named = effect_from_estimate(Estimate(only, candidate, np.zeros(0), np.zeros((0, 0))), part)
     assert named.to_dict()["cannot_be_told_from"] == [f"stereo.{name}" for name in alike]
-    assert named.alternatives == (["stereo.camera_omega together with stereo.camera_phi"] if alike else [])
+    together = ["stereo.camera_omega together with stereo.camera_phi"] if alike else []
+    assert named.alternatives == together
+    also_alone = replace(only, indistinguishable=("camera_phi",))
+    named = effect_from_estimate(Estimate(also_alone, candidate, np.zeros(0), np.zeros((0, 0))), part)
+    assert named.alternatives == ["stereo.camera_phi", *together]
 
 
 @pytest.mark.parametrize(("places", "named"), [(5.0, {"collimation", "range_scale"}), (75.0, set())])

@@ -60,6 +60,7 @@ class NamedEffect:
     split_by : further measurement that would tell it from those in `indistinguishable`, in words; "" if there are none.
     replacing_pair : names of two effects that together explain the measurement as well, in place of this one, or of this one
         and another named one; they are among the indistinguishable ones. Empty if there are none.
+    only_together : those of the pair that do not explain the measurement as well without the other one.
     """
 
     name: str
@@ -71,11 +72,12 @@ class NamedEffect:
     gain: float
     split_by: str = ""
     replacing_pair: tuple[str, ...] = ()
+    only_together: tuple[str, ...] = ()
 
     @property
     def alternatives(self) -> list[str]:
         """Explanations that fit this measurement as well, in words: an effect's name, or two joined by "together with"."""
-        single = [name for name in self.indistinguishable if name not in self.replacing_pair]
+        single = [name for name in self.indistinguishable if name not in self.only_together]
         return [*single, *filter(None, [" together with ".join(self.replacing_pair)])]
 
     @property
@@ -309,7 +311,8 @@ def effect_from_estimate(found: Estimate, part: Residuals) -> NamedEffect:
     std = _standard_deviations(candidate, found.values, found.covariance)
     alike = dict.fromkeys([*item.indistinguishable, *item.replacing_pair])
     named = _named(part.sensor, entry, std, ratio, alike=alike, p_value=p_value)
-    return replace(named, replacing_pair=tuple(f"{part.sensor}.{name}" for name in item.replacing_pair))
+    pair = {f"{part.sensor}.{name}": name in item.indistinguishable for name in item.replacing_pair}
+    return replace(named, replacing_pair=tuple(pair), only_together=tuple(name for name, alone in pair.items() if not alone))
 
 
 def _standard_deviations(candidate: Candidate, values: FloatArray, covariance: FloatArray) -> dict[str, float]:
