@@ -8,12 +8,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from pipeline.change.robust import nmad
-from pipeline.formats.measurements.measurement import Measurement
+from pipeline.formats.measurements.measurement import Measurement, StereoMeasurement
 from pipeline.gap.mean.candidates import Candidate, prior_precision
 from pipeline.gap.mean.selection import SelectedEffect
 from pipeline.gap.naming.named_effects import Estimate, aligned_with, effect_from_estimate, out_of_bounds
 from pipeline.gap.residuals.alignment import fit_pose_robustly
 from pipeline.gap.residuals.residuals import Residuals
+from pipeline.gap.residuals.stereo_residuals import StereoResiduals, with_shaped_disparities
 from pipeline.gap.thresholds import thresholds
 from scene.geometry.mesh import FloatArray
 
@@ -78,6 +79,8 @@ def screen_effects(measurement: Measurement, part: Residuals, candidates: Sequen
     rows = np.arange(0, len(part), max(len(part) // _FEWEST_POINTS, 1))
     few = part.part(rows)
     points, few = measurement.part(few.index), replace(few, index=np.arange(len(rows)))
+    if isinstance(points, StereoMeasurement) and isinstance(few, StereoResiduals):
+        points = with_shaped_disparities(points, few)
     at_few = (each.part(rows) for each in candidates)
     fits = (_ScreenedEffect.of(points, few, estimate_of_size(each, gauss_newton_step(few, [each]))) for each in at_few)
     screened = zip(candidates, fits, strict=True)

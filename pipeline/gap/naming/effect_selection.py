@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import cache, partial
+from functools import cache, cached_property, partial
 from typing import Any
 
 import numpy as np
@@ -28,7 +28,7 @@ from pipeline.gap.naming.named_effects import (
     out_of_bounds,
     within_bounds,
 )
-from pipeline.gap.naming.nonlinear_refit import select_and_refit, with_classes_at_fit
+from pipeline.gap.naming.nonlinear_refit import outline_effects, select_and_refit, with_classes_at_fit
 from pipeline.gap.naming.search_beside_effects import repeat_search
 from pipeline.gap.naming.search_outcome import SearchInput, SearchOutcome
 from pipeline.gap.naming.search_residuals import with_added_variance, with_fitted_variance
@@ -141,7 +141,64 @@ class SelectionInput:
         return replace(self, excluded=self.excluded | families, grid_noise=None)
 
 
-def select_effects(given: SelectionInput) -> tuple[list[NamedEffect], SelectionResult]:
+class SelectionStart:
+    """The first, linearised search of a selection: the normal equations of all effects, and what must be known before.
+
+    Attributes
+    ----------
+    given : residuals of the training points, and what is not tried.
+    """
+
+    def __init__(self, given: SelectionInput) -> None:
+        """Compute nothing yet. given: input of the selection."""
+        self.given = given
+
+    @cached_property
+    def tiles(self) -> NamedEffect | None:
+        """Shifts of a stereo matcher's tiles, beside which all else is searched."""
+        return _shifted_tiles(self.given)
+
+    @cached_property
+    def apart(self) -> _FoundApart:
+        """Rounded ranges or locked disparities."""
+        return _FoundApart.of(self.given)
+
+    @cached_property
+    def part(self) -> Residuals:
+        """The residuals, with the variance of rounding or locking added to the predicted one."""
+        return with_added_variance(self.given.part, self.apart.variance)
+
+    @cached_property
+    def noise(self) -> _FittedNoise:
+        """Noise terms beside no systematic effect."""
+        return _FittedNoise.of(self.given, self.part, WallCells.over(self.part.wall_xy), self.given.registered(self.part))
+
+    @cached_property
+    def search(self) -> SearchInput:
+        """Input of all searches for systematic effects."""
+        families = _families(self.given, self.part, self.apart)
+        terms_at = partial(_noise_terms_at, self.given, self.part)
+        return SearchInput(self.given.measurement, self.part, families, terms_at, self.apart.variance, self.given.random)
+
+    @cached_property
+    def first(self) -> MeanSearch:
+        """The linearised search."""
+        known = [] if self.given.grid_noise is None else [self.given.grid_noise]
+        weighted = with_fitted_variance(self.part, self.noise.terms or known, self.apart.noise_ratio)
+        return MeanSearch(weighted, self.search.families, self.given.random)
+
+    def outline(self) -> list[NamedEffect]:
+        """Return the effects that the linearised search selects, refitted together without linearising.
+
+        They may be the wrong ones, but together they explain most of what is systematic in the residuals. That suffices to search
+        effects at depth steps beside them, and takes much less time than `select_effects`.
+        """
+        if self.tiles is not None:
+            return [self.tiles]
+        return [*self.apart.named, *(effect_from_estimate(each, self.part) for each in outline_effects(self.search, self.first))]
+
+
+def select_effects(given: SelectionInput, start: SelectionStart | None = None) -> tuple[list[NamedEffect], SelectionResult]:
     """Find the systematic sensor errors and noise terms that explain the residuals of a measurement (forward selection).
 
     A linearised search finds systematic effects. They are put into the sensor model, residuals are computed again, and further
@@ -149,20 +206,16 @@ def select_effects(given: SelectionInput) -> tuple[list[NamedEffect], SelectionR
     weight the next search. If the fitted value of an effect is implausible, the effect is excluded, and the selection is
     repeated. The effects that were found are returned, and the scores and tests of the selection.
 
-    given : residuals of the training points, and what is not tried.
+    given : residuals of the training points, and what is not tried. start: the linearised search of this input, if it was made
+    before.
     """
-    measurement, random = given.measurement, given.random
-    if (tiles := _shifted_tiles(given)) is not None:
-        return _select_beside_tiles(given, tiles)
-    apart = _FoundApart.of(given)
-    part = with_added_variance(given.part, apart.variance)
-    noise = _FittedNoise.of(given, part, WallCells.over(part.wall_xy), given.registered(part))
+    start = start or SelectionStart(given)
+    if start.tiles is not None:
+        return _select_beside_tiles(given, start.tiles)
+    measurement, part, noise = given.measurement, start.part, start.noise
     if wrong := noise.implausible(measurement):
         return select_effects(given.without(wrong))
-    families = _families(given, part, apart)
-    known = [] if given.grid_noise is None else [given.grid_noise]
-    search = SearchInput(measurement, part, families, partial(_noise_terms_at, given, part), apart.variance, random)
-    first = MeanSearch(with_fitted_variance(part, noise.terms or known, apart.noise_ratio), families, random)
+    search, first = start.search, start.first
     found = select_and_refit(search, first)
     wrong = out_of_bounds(measurement, found.estimates, found.residuals)
     design = found.search.design
@@ -177,8 +230,9 @@ def select_effects(given: SelectionInput) -> tuple[list[NamedEffect], SelectionR
         return select_effects(given.without(wrong))
     found = with_classes_at_fit(search, found)
     systematic = [effect_from_estimate(each, found.residuals) for each in found.estimates]
-    result = _result(given, search, first, found, noise, left, frozenset(item.name for item in systematic), apart.locking)
-    return [*apart.named, *systematic, *(effect_from_variance(each, part.sensor) for each in noise.terms)], result
+    names = frozenset(item.name for item in systematic)
+    result = _result(given, search, first, found, noise, left, names, start.apart.locking)
+    return [*start.apart.named, *systematic, *(effect_from_variance(each, part.sensor) for each in noise.terms)], result
 
 
 def _shifted_tiles(given: SelectionInput) -> NamedEffect | None:

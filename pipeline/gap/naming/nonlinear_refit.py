@@ -182,6 +182,16 @@ def select_and_refit(given: SearchInput, first: MeanSearch) -> SearchOutcome:
     return linear if best is None else best
 
 
+def outline_effects(given: SearchInput, first: MeanSearch) -> list[Estimate]:
+    """Refit the effects of the catalogue that a linearised search selects, together and without linearising.
+
+    None are returned if a sensor model does not accept them, or if too few rays meet the reference with them.
+    """
+    estimates = [each for each in estimates_of(first, first.select()[0]) if not each.candidate.empirical]
+    together = _Refit.of(given, first, estimates) if estimates else None
+    return [] if together is None else [*_converged(given, first, together).estimates]
+
+
 def _relinearised(given: SearchInput, found: SearchOutcome) -> SearchOutcome:
     """Repeat a selection with derivatives taken at the model that holds its effects, until it selects the same ones again.
 

@@ -13,7 +13,7 @@ from pipeline.formats.measurements.measurement import Measurement, StereoMeasure
 from pipeline.gap.mean.candidates import Candidate
 from pipeline.gap.naming.candidate_families import catalogue_families, model_has
 from pipeline.gap.naming.effect_screening import screen_effects
-from pipeline.gap.naming.effect_selection import SelectionInput, SelectionResult, select_effects
+from pipeline.gap.naming.effect_selection import SelectionInput, SelectionResult, SelectionStart, select_effects
 from pipeline.gap.naming.named_effects import (
     NamedEffect,
     aligned_with,
@@ -25,10 +25,11 @@ from pipeline.gap.noise_and_edges.beam_footprint import find_footprint
 from pipeline.gap.noise_and_edges.disparity_edges import find_disparity_edge_effects
 from pipeline.gap.noise_and_edges.edge_effects import EdgeEffect
 from pipeline.gap.residuals.alignment import align, compute_residuals, fit_pose_robustly
+from pipeline.gap.residuals.disparity_raster import raster_cell_count, raster_cell_px
 from pipeline.gap.residuals.residuals import BoolArray, Residuals
 from pipeline.gap.residuals.scene_changes import SceneChange, drop_duplicates, find_scene_changes
 from pipeline.gap.residuals.sensor_view import SensorView
-from pipeline.gap.residuals.stereo_residuals import StereoResiduals
+from pipeline.gap.residuals.stereo_residuals import StereoResiduals, with_shaped_disparities
 from pipeline.gap.residuals.tls_residuals import TlsResiduals
 from pipeline.gap.residuals.wall_blocks import BlockGrid
 from pipeline.gap.thresholds import thresholds
@@ -39,6 +40,8 @@ from sensors.effects.smoothing import Smoothing
 
 _MOST_POINTS = 60_000
 """Most points that a selection uses; more add little information to about 800 cells."""
+_MOST_CELLS = 400_000
+"""Most cells of a raster of pixels on which edge effects are simulated anew for each trial of another error (0.4 s)."""
 
 
 @dataclass(frozen=True)
@@ -148,15 +151,26 @@ class PassInput:
     def training_part(self) -> tuple[Measurement, Residuals]:
         """The measurement and the residuals of the training points alone, from which sensor errors are selected.
 
-        The shift of these points by edge effects (errors at depth steps) is not computed again while the pose is fitted: a move
-        by millimetres hardly changes it.
+        On a large raster of pixels the shift of these points by edge effects (errors at depth steps) is not computed again while
+        other errors are put into the model, to save time. It is then a little wrong beside errors that move the rays.
         """
         measurement, residuals = self.measurement, self.residuals
         if isinstance(measurement, StereoMeasurement) and isinstance(residuals, StereoResiduals):
-            shaped = np.zeros(len(measurement.cloud.points))
-            shaped[residuals.index] = residuals.geometry.shaped
-            measurement = measurement.changed(shaped_px=shaped)
+            at = residuals.geometry
+            if raster_cell_count(at.u, at.v, raster_cell_px(at.u, at.v) or 1.0) > _MOST_CELLS:
+                measurement = with_shaped_disparities(measurement, residuals)
         return subsample(measurement, residuals, self.training_rows)
+
+    def start(self, random: KeyedRandom, excluded: frozenset[tuple[str, bool]]) -> SelectionStart:
+        """Prepare the search for sensor errors (effects).
+
+        Parameters
+        ----------
+        random : source of random numbers for the null distributions.
+        excluded : effects that are not tried, as pairs (name, whether it is an empirical term).
+        """
+        noise = None if self.large_effect is None else self.registered_residuals[self.training_rows]
+        return SelectionStart(SelectionInput(*self.training_part, self.noise_ratio, random, excluded, noise))
 
 
 @dataclass(frozen=True)
@@ -173,20 +187,6 @@ class SelectionPass:
     pass_input: PassInput
     named: list[NamedEffect]
     selection: SelectionResult
-
-    @classmethod
-    def of(cls, pass_input: PassInput, random: KeyedRandom, excluded: frozenset[tuple[str, bool]]) -> SelectionPass:
-        """Run the search for sensor errors (effects) on one input.
-
-        Parameters
-        ----------
-        pass_input : the measurement and its residuals, with certain effects at depth steps in the sensor model.
-        random : source of random numbers for the null distributions.
-        excluded : effects that are not tried, as pairs (name, whether it is an empirical term).
-        """
-        noise = None if pass_input.large_effect is None else pass_input.registered_residuals[pass_input.training_rows]
-        given = SelectionInput(*pass_input.training_part, pass_input.noise_ratio, random, excluded, noise)
-        return cls(pass_input, *select_effects(given))
 
 
 def _names(effects: list[EdgeEffect]) -> set[str]:
@@ -258,14 +258,14 @@ class PassInputs:
             return found if Smoothing.tag() in _names(beside) else beside
         return found
 
-    def edge_effects_given(self, found: SelectionPass) -> list[EdgeEffect]:
+    def edge_effects_given(self, named: list[NamedEffect]) -> list[EdgeEffect]:
         """Search effects at depth steps (edge effects) again, with other errors in the model that can hide or imitate them.
 
         The pose is estimated with the edge effects of the first search in the model too, because edge fattening shifts it.
 
-        found: a run of the search, with the sensor errors to put into the model first.
+        named: the sensor errors to put into the model first.
         """
-        return self._edge_effects_beside(found.named, [effect_from_edges(each) for each in found.pass_input.edge_effects])
+        return self._edge_effects_beside(named, [effect_from_edges(each) for each in self.edge_effects])
 
     def _edge_effects_beside(self, named: list[NamedEffect], known: list[NamedEffect]) -> list[EdgeEffect]:
         """Find edge effects beside other effects. known: edge effects that are in the model while the pose is estimated."""
@@ -283,8 +283,8 @@ class PassInputs:
 def select_beside_edge_effects(inputs: PassInputs, random: KeyedRandom, excluded: frozenset[tuple[str, bool]]) -> SelectionPass:
     """Search for sensor errors, with those effects at depth steps (edge effects) in the model that the residuals show.
 
-    Other errors can hide or imitate edge effects. These are therefore searched again with the named errors in the model; if
-    others show then, the search for errors is repeated beside them.
+    Other errors can hide or imitate edge effects. These are therefore searched again with the errors in the model that a
+    linearised search finds, before the search proper.
 
     Parameters
     ----------
@@ -292,15 +292,16 @@ def select_beside_edge_effects(inputs: PassInputs, random: KeyedRandom, excluded
     random : source of random numbers for the null distributions.
     excluded : sensor errors that are not tried, as pairs (name, whether it is an empirical term).
     """
-    found = SelectionPass.of(inputs.with_these(inputs.edge_effects), random, excluded)
-    if not found.named:
-        return found
-    before = _names(found.pass_input.edge_effects)
-    imitated = {Smoothing.tag()} - before  # a small error of the rays' directions looks like smoothing
-    edge_effects = [each for each in inputs.edge_effects_given(found) if each.name not in imitated]
-    if _names(edge_effects) == before:
-        return found
-    return SelectionPass.of(inputs.with_these(edge_effects), random, excluded)
+    pass_input = inputs.with_these(inputs.edge_effects)
+    start = pass_input.start(random, excluded)
+    if outline := start.outline():
+        before = _names(pass_input.edge_effects)
+        imitated = {Smoothing.tag()} - before  # a small error of the rays' directions looks like smoothing
+        edge_effects = [each for each in inputs.edge_effects_given(outline) if each.name not in imitated]
+        if _names(edge_effects) != before:
+            pass_input = inputs.with_these(edge_effects)
+            start = pass_input.start(random, excluded)
+    return SelectionPass(pass_input, *select_effects(start.given, start))
 
 
 def subsample_rows(rows: NDArray[np.int64]) -> NDArray[np.int64]:

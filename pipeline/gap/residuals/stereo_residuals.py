@@ -161,6 +161,17 @@ def with_surroundings(measurement: StereoMeasurement, found: StereoResiduals) ->
     return measurement.changed(surroundings=everywhere.changed(found.index, about))
 
 
+def with_shaped_disparities(measurement: StereoMeasurement, found: StereoResiduals) -> StereoMeasurement:
+    """Store in a stereo measurement by how much effects on neighbouring pixels change its disparities, to save computing it again.
+
+    Such effects are edge fattening, smoothing and filled occlusions. What is stored stays valid for pixels that see the same places
+    to a small part of the filter's width. found: residuals of the measurement, with these effects in the model.
+    """
+    shaped = np.zeros(len(measurement.cloud.points))
+    shaped[found.index] = found.geometry.shaped
+    return measurement.changed(shaped_px=shaped)
+
+
 def _has_pixels(measurement: StereoMeasurement) -> bool:
     """Tell whether the points come with their pixels."""
     return "pixel_x" in measurement.cloud.extra and "pixel_y" in measurement.cloud.extra
