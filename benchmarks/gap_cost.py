@@ -43,6 +43,7 @@ PARTS: dict[str, list[tuple[Any, str]]] = {
         *((module, "candidate_families") for module in (effect_selection, search_beside_effects)),
         (nonlinear_refit, "catalogue_families"),
     ],
+    "outline": [(effect_selection, "outline_effects")],
     "search: design and null": [(MeanSearch, "__init__")],
     "search: selection": [(MeanSearch, "select")],
     "refits": [(nonlinear_refit, name) for name in ("_strongest_single_fits", "_screened_single_fits", "_relinearised")],

@@ -19,22 +19,16 @@ from unittest.mock import patch
 from pipeline.formats.measurements.measurement import FILE, read_measurement
 from pipeline.gap.mean.search import MeanSearch
 from pipeline.gap.naming import effect_selection, nonlinear_refit, validation_scores, workflow
-from pipeline.gap.naming.selection_passes import PassInputs, SelectionPass
+from pipeline.gap.naming.selection_passes import PassInputs
 from pipeline.gap.naming.validation_scores import ValidatedEffects
 from pipeline.gap.noise_and_edges import disparity_edges, variance_model
-
-
-def _first_pass(inputs: PassInputs, random: Any, excluded: Any) -> SelectionPass:
-    """Select effects without searching edge effects again."""
-    return SelectionPass.of(inputs.with_these(inputs.edge_effects), random, excluded)
-
 
 STEPS: dict[str, tuple[Any, str, Any]] = {
     "each effect is tried alone": (nonlinear_refit, "_screened_single_fits", lambda given, first, alone: alone),
     "relinearised selection": (nonlinear_refit, "_relinearised", lambda given, found: found),
     "pose beside edge fattening": (workflow, "align_beside_fattening", lambda pair, initial, found, trusted: found),
     "windows of edge fattening": (disparity_edges, "_WINDOWS", ()),
-    "edge effects searched again": (workflow, "select_beside_edge_effects", _first_pass),
+    "edge effects searched again": (effect_selection.SelectionStart, "outline", lambda start: []),
     "tiles with unequal shifts": (effect_selection, "_unequal_tiles", lambda *_: None),
     "overtones of a wave": (MeanSearch, "_with_overtones", lambda search, members, form: form),
     "groups of effects validated": (validation_scores, "_groups", lambda effects: []),

@@ -13,6 +13,7 @@ from pipeline.formats.measurements.measurement import Measurement, read_measurem
 from pipeline.gap.mean.candidates import Candidate, SineGrid
 from pipeline.gap.naming import effect_selection, search_beside_effects
 from pipeline.gap.naming.candidate_families import candidate_families
+from pipeline.gap.naming.named_effects import aligned_with
 from pipeline.gap.residuals.alignment import align, fit_pose_robustly
 from pipeline.gap.residuals.residuals import Residuals
 from scene.common.keyed_random import KeyedRandom
@@ -47,6 +48,19 @@ def test_what_one_of_two_true_effects_leaves_is_significant(tmp_path: Path, monk
         alone = result.p_value_given([kept])
         assert alone is not None, "the misfit beside a part of the effects was not tested"
         assert alone <= 0.01
+
+
+def test_an_outline_explains_what_is_systematic(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The quick search before the selection finds both errors; the residuals beside them are as small as the noise."""
+    write_scan(tmp_path, 5, step_rad=0.009, ranges=_ranges)
+    monkeypatch.setattr(effect_selection, "candidate_families", _few)
+    there, residuals, _ = align(read_measurement(tmp_path))
+    part = residuals.part(residuals.usable)
+    before = fit_pose_robustly(part)[2]
+    outline = effect_selection.SelectionStart(effect_selection.SelectionInput(there, part, before, KeyedRandom(1))).outline()
+    assert {item.name for item in outline} == {f"tls.{name}" for name in TRUE}
+    left = aligned_with(there, outline).residuals
+    assert fit_pose_robustly(left.part(left.usable))[2] < 1.05 < before
 
 
 def test_an_empirical_term_that_is_kept_counts_in_the_misfit_that_is_left(tmp_path: Path) -> None:

@@ -17,7 +17,7 @@ from pipeline.gap.mean.candidates import Candidate
 from pipeline.gap.mean.search import MeanSearch
 from pipeline.gap.naming.candidate_families import catalogue_families
 from pipeline.gap.naming.named_effects import within_bounds
-from pipeline.gap.naming.selection_passes import PassInputs, SelectionPass
+from pipeline.gap.naming.selection_passes import PassInputs
 from pipeline.gap.noise_and_edges.disparity_edges import align_beside_fattening, find_disparity_edge_effects
 from pipeline.gap.residuals.alignment import align, compute_residuals, fit_pose_robustly
 from pipeline.gap.residuals.disparity_raster import raster_cell_px
@@ -75,8 +75,7 @@ def test_a_window_that_takes_the_nearest_rock_is_found_beside_its_pose(
     inputs = PassInputs(
         found.measurement, found.residuals, np.zeros(len(there.cloud.points), dtype=bool), BlockGrid(np.zeros(2), 1.0)
     )
-    selection: Any = None
-    (again,) = inputs.edge_effects_given(SelectionPass(inputs.with_these(inputs.edge_effects), [], selection))
+    (again,) = inputs.edge_effects_given([])
     assert isinstance(again.effect, EdgeFattening)
     assert (again.effect.window, again.effect.radius_px) == ("square", named.effect.radius_px), "it starts from the first pose"
 

@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 import pytest
 from gap_cases import write_scan
+from numpy.typing import NDArray
 
 from benchmarks.gap_closed_form.cases import Case, make
 from pipeline.formats.measurements.measurement import StereoMeasurement, read_measurement
@@ -23,14 +24,14 @@ from pipeline.gap.naming.effect_selection import NONPARAMETRIC_TERMS
 from pipeline.gap.naming.gap_score import simulate_errors
 from pipeline.gap.naming.named_effects import NamedEffect, with_effects
 from pipeline.gap.naming.selection_notes import _note_most_similar
-from pipeline.gap.naming.selection_passes import PassInput, PassInputs, SelectionPass, select_beside_edge_effects
+from pipeline.gap.naming.selection_passes import PassInput, PassInputs, select_beside_edge_effects
 from pipeline.gap.naming.validation_scores import ValidatedEffects
 from pipeline.gap.noise_and_edges.edge_effects import EdgeEffect
 from pipeline.gap.noise_and_edges.variance_model import VarianceTerm
 from pipeline.gap.residuals.alignment import align, at_points_of, compute_residuals
 from pipeline.gap.residuals.disparity_raster import DisparityRaster
 from pipeline.gap.residuals.nominal_pair import NominalPair, real_pair
-from pipeline.gap.residuals.stereo_residuals import stereo_residuals
+from pipeline.gap.residuals.stereo_residuals import StereoResiduals, stereo_residuals
 from pipeline.gap.residuals.wall_blocks import BlockGrid
 from scene.common.keyed_random import KeyedRandom
 from sensors.effects.edge_fattening import EdgeFattening
@@ -190,12 +191,13 @@ def test_a_low_pass_that_others_feign_takes_no_outlines_along(monkeypatch: pytes
     nowhere = np.zeros(1, dtype=bool)
     seen = [EdgeEffect(effect, {}, 50.0, nowhere) for effect in (EdgeFattening(radius_px=3.0), Smoothing(sigma_px=2.0))]
 
-    def named(_: Any, state: list[EdgeEffect], *_given: Any) -> Any:
-        return SimpleNamespace(named=["noise"], pass_input=SimpleNamespace(edge_effects=state))
+    def with_these(effects: list[EdgeEffect]) -> Any:
+        start = SimpleNamespace(given=None, outline=lambda: ["camera_phi"])
+        return SimpleNamespace(edge_effects=effects, start=lambda *_: start)
 
-    monkeypatch.setattr(SelectionPass, "of", classmethod(named))
-    starts: Any = SimpleNamespace(edge_effects=[], edge_effects_given=lambda _: seen, with_these=lambda effects: effects)
-    found = select_beside_edge_effects(starts, KeyedRandom(1), frozenset())
+    monkeypatch.setattr(selection_passes, "select_effects", lambda *_: ([], None))
+    inputs: Any = SimpleNamespace(edge_effects=[], edge_effects_given=lambda _: seen, with_these=with_these)
+    found = select_beside_edge_effects(inputs, KeyedRandom(1), frozenset())
     assert [each.name for each in found.pass_input.edge_effects] == ["edge_fattening"]
 
 
@@ -218,25 +220,58 @@ def test_an_unknown_without_a_name_says_what_remains_is_most_like() -> None:
         assert all("a change with azimuth (spline), 8 mm" in words for words in said)
 
 
-def test_what_shapes_do_is_found_once_for_a_search(tmp_path: Path) -> None:
-    """The search computes the change by edge effects once and passes it on to its trials.
-
-    It takes it from the whole raster, including points that miss the reference.
-    """
+@pytest.fixture(name="smoothed_disparities")
+def _smoothed_disparities(tmp_path: Path) -> StereoMeasurement:
+    """A quiet measurement whose model has a wide low-pass."""
     make(Case(0, (3, 1), "none", "stereo", (), 15_000, 15_000), tmp_path / "case", tmp_path / "truth.json", baselines=False)
     read = read_measurement(tmp_path / "case")
-    there = read.changed(model=with_effects(read.model, [{"name": "smoothing", "sigma_px": 40.0}]))
-    plain, nowhere = compute_residuals(there), np.zeros(len(there.cloud.points), dtype=bool)
-    pass_input = PassInput.of(there, plain, nowhere, [])
+    assert isinstance(read, StereoMeasurement)
+    return read.changed(model=with_effects(read.model, [{"name": "smoothing", "sigma_px": 40.0}]))
+
+
+def _training_part(measurement: StereoMeasurement) -> tuple[StereoMeasurement, StereoResiduals, NDArray[np.int64]]:
+    """The part of a measurement from which effects are selected, its residuals, and its row numbers in the measurement.
+
+    No point is kept for validation.
+    """
+    nowhere = np.zeros(len(measurement.cloud.points), dtype=bool)
+    pass_input = PassInput.of(measurement, compute_residuals(measurement), nowhere, [])
     part, residuals = pass_input.training_part
+    assert isinstance(part, StereoMeasurement)
+    assert isinstance(residuals, StereoResiduals)
+    return part, residuals, pass_input.residuals.index[pass_input.training_rows]
+
+
+def test_what_a_low_pass_does_is_kept_for_a_search_on_a_large_raster(
+    smoothed_disparities: StereoMeasurement, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It is taken from the whole raster, including points that miss the reference, and is passed on to all trials."""
+    monkeypatch.setattr(selection_passes, "_MOST_CELLS", 1000)
+    part, residuals, _ = _training_part(smoothed_disparities)
     found = compute_residuals(part).value
     assert len(found) > 1000
     np.testing.assert_allclose(found, residuals.value, atol=1e-6)
-    assert isinstance(part, StereoMeasurement)
     assert part.shaped_px is not None
     assert np.std(part.shaped_px) > 0.01, "px that the low-pass does"
     moved = compute_residuals(part.changed(shaped_px=part.shaped_px + 1))
     np.testing.assert_allclose(moved.value, found - 1)
+
+
+def test_what_a_low_pass_does_follows_the_rays_that_another_error_moves(smoothed_disparities: StereoMeasurement) -> None:
+    """A principal point that is off by 6 px shows other places of the rock: a sixth of the low-pass's width away.
+
+    The part from which effects are selected has the same raster as the whole measurement, except at its border.
+    """
+    part, residuals, rows = _training_part(smoothed_disparities)
+    turned = [{"name": "principal_point_x", "camera": "both", "delta_px": 6.0}]
+    here, there = (
+        stereo_residuals(each.changed(model=with_effects(each.model, turned))) for each in (part, smoothed_disparities)
+    )
+    expected = there.values_at(there.geometry.shaped, rows[here.index])
+    before = residuals.values_at(residuals.geometry.shaped, here.index)
+    assert len(here) > 1000
+    assert np.nanstd(before - expected) > 0.1 * np.nanstd(expected), "the rays see other rock"
+    assert np.mean(np.abs(here.geometry.shaped - expected) < 0.02 * np.nanstd(expected)) > 0.9
 
 
 @pytest.mark.parametrize(("beside", "kept"), [(["smoothing", "edge_fattening"], True), (["edge_fattening"], False), ([], False)])

@@ -316,17 +316,19 @@ def _screened_single_fits(given: SearchInput, first: MeanSearch, alone: list[_Re
 
     Returns
     -------
-    The best fit of each effect, the best effect first.
+    The best fit of each effect, the best effect first. A given fit is kept if a new one is hardly better.
     """
     sized = screen_effects(given.measurement, given.part, first.effect_variants(), _MOST_CONVERGED)
     more = [each for each in (_single_fit(given, first, item.candidate, item.values) for item in sized) if each is not None]
     refitted = [each for each in _best_variants(given, first, more) if each.is_significant(given, first)] if more else []
     if not refitted:
         return alone
-    best: dict[str, _Refit] = {}
-    for each in _ranked_on_common_points([*alone, *refitted], first):
-        best.setdefault(each.name, each)
-    return list(best.values())
+    fits = _on_common_points([*alone, *refitted], first)
+    best = {each.name: each for each in fits[: len(alone)]}
+    for each in fits[len(alone) :]:
+        if each.name not in best or each.score > best[each.name].score + _CONVERGED_GAIN:
+            best[each.name] = each
+    return sorted(best.values(), key=lambda each: -each.score)
 
 
 def _single_fit(given: SearchInput, first: MeanSearch, candidate: Candidate, values: FloatArray | None = None) -> _Refit | None:

@@ -32,8 +32,8 @@ _BLOCKS = 64
 _FEWEST = 100
 """Fewest points for outliers to be rejected."""
 _RETRACE_FROM_SIGMAS, _MOST_MOVES, _MOST_MOVES_OF_SURFACES = 0.1, 3, 12
-"""A pose that changes the residuals by more than this, in predicted sigmas averaged over the points, needs new residuals; and how
-often that is repeated at most. A surface without cameras takes more moves: its nearest places on the reference change as it moves.
+"""A pose that changes the residuals by more than this, in predicted sigmas averaged over the points, needs new residuals; and
+how often that is repeated at most. A surface without cameras takes more moves: its nearest places on the reference change.
 """
 _RETRACE_FROM_M = 0.002
 """Rays must also move by more than this on the wall, m, to be traced again."""

@@ -162,10 +162,10 @@ def with_surroundings(measurement: StereoMeasurement, found: StereoResiduals) ->
 
 
 def with_shaped_disparities(measurement: StereoMeasurement, found: StereoResiduals) -> StereoMeasurement:
-    """Store in a stereo measurement by how much effects on neighbouring pixels change its disparities, to save computing it again.
+    """Store in a stereo measurement what effects on neighbouring pixels change, px of disparity, to save computing it again.
 
-    Such effects are edge fattening, smoothing and filled occlusions. What is stored stays valid for pixels that see the same places
-    to a small part of the filter's width. found: residuals of the measurement, with these effects in the model.
+    Such effects are edge fattening, smoothing and filled occlusions. What is stored stays valid while each pixel sees the same
+    place to a small part of the filter's width. found: residuals of the measurement, with these effects in the model.
     """
     shaped = np.zeros(len(measurement.cloud.points))
     shaped[found.index] = found.geometry.shaped
