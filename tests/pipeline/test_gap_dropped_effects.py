@@ -30,15 +30,19 @@ def _few(measurement: Measurement, part: Residuals, *_: Any) -> list[Candidate |
     return [each for each in candidate_families(measurement, part) if each.name in (*TRUE, "range_offset", "range_scale")]
 
 
+def _start(measurement: Measurement, part: Residuals) -> effect_selection.SelectionStart:
+    """Start a selection of effects."""
+    given = effect_selection.SelectionInput(measurement, part, fit_pose_robustly(part)[2], KeyedRandom(1))
+    return effect_selection.SelectionStart.of(given)
+
+
 def test_what_one_of_two_true_effects_leaves_is_significant(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     write_scan(tmp_path, 5, step_rad=0.009, ranges=_ranges)
     monkeypatch.setattr(effect_selection, "candidate_families", _few)
     monkeypatch.setattr(search_beside_effects, "candidate_families", _few)
     there, residuals, _ = align(read_measurement(tmp_path))
     part = residuals.part(residuals.usable)
-    named, result = effect_selection.select_effects(
-        effect_selection.SelectionInput(there, part, fit_pose_robustly(part)[2], KeyedRandom(1))
-    )
+    named, result = effect_selection.select_effects(_start(there, part))
     systematic = [item for item in named if not item.adds_variance]
     assert {item.name for item in systematic} == {f"tls.{name}" for name in TRUE}
     both = result.p_value_given(systematic)
@@ -56,8 +60,7 @@ def test_an_outline_explains_what_is_systematic(tmp_path: Path, monkeypatch: pyt
     monkeypatch.setattr(effect_selection, "candidate_families", _few)
     there, residuals, _ = align(read_measurement(tmp_path))
     part = residuals.part(residuals.usable)
-    before = fit_pose_robustly(part)[2]
-    outline = effect_selection.SelectionStart(effect_selection.SelectionInput(there, part, before, KeyedRandom(1))).outline()
+    before, outline = fit_pose_robustly(part)[2], _start(there, part).outline()
     assert {item.name for item in outline} == {f"tls.{name}" for name in TRUE}
     left = aligned_with(there, outline).residuals
     assert fit_pose_robustly(left.part(left.usable))[2] < 1.05 < before
@@ -68,9 +71,7 @@ def test_an_empirical_term_that_is_kept_counts_in_the_misfit_that_is_left(tmp_pa
     write_scan(tmp_path, 5, step_rad=0.009, ranges=lambda scan: scan.R + 0.004 * np.tanh(8 * (scan.az - 1.6)))
     there, residuals, _ = align(read_measurement(tmp_path))
     part = residuals.part(residuals.usable)
-    named, result = effect_selection.select_effects(
-        effect_selection.SelectionInput(there, part, fit_pose_robustly(part)[2], KeyedRandom(1))
-    )
+    named, result = effect_selection.select_effects(_start(there, part))
     assert "empirical" in {item.kind for item in named}
     assert result.systematic == {item.name for item in named if not item.adds_variance}
     assert result.p_value_given(named) == result.p_value

@@ -400,7 +400,9 @@ def test_noise_on_a_coarse_grid_counts_as_no_error_of_the_reference(tmp_path: Pa
         "candidate_families",
         lambda *known: [each for each in candidate_families(*known) if isinstance(each, Candidate)][:3],
     )
-    named, naming = steps.select_effects(steps.SelectionInput(there, part, fit_pose_robustly(part)[2], KeyedRandom(1)))
+    named, naming = steps.select_effects(
+        steps.SelectionStart.of(steps.SelectionInput(there, part, fit_pose_robustly(part)[2], KeyedRandom(1)))
+    )
     assert [item.name for item in named] == ["stereo.regularization_noise"]
     assert naming.p_value is not None
     assert naming.p_value > 0.01

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import cache, cached_property, partial
+from functools import cache, partial
 from typing import Any
 
 import numpy as np
@@ -141,51 +141,44 @@ class SelectionInput:
         return replace(self, excluded=self.excluded | families, grid_noise=None)
 
 
+@dataclass(frozen=True, eq=False)
 class SelectionStart:
-    """The first, linearised search of a selection: the normal equations of all effects, and what must be known before.
+    """The first, linearised search of a selection, and what must be known before.
 
     Attributes
     ----------
-    given : residuals of the training points, and what is not tried.
+    given : residuals of the training points, and what is not tried: effects whose noise terms are implausible too.
+    tiles : shifts of a stereo matcher's tiles, which are in the sensor model of `given`; None without.
+    apart : rounded ranges or locked disparities.
+    noise : noise terms beside no systematic effect.
+    search : input of all searches for systematic effects.
+    first : the linearised search.
     """
 
-    def __init__(self, given: SelectionInput) -> None:
-        """Compute nothing yet. given: input of the selection."""
-        self.given = given
+    given: SelectionInput
+    tiles: NamedEffect | None
+    apart: _FoundApart
+    noise: _FittedNoise
+    search: SearchInput
+    first: MeanSearch
 
-    @cached_property
-    def tiles(self) -> NamedEffect | None:
-        """Shifts of a stereo matcher's tiles, beside which all else is searched."""
-        return _shifted_tiles(self.given)
-
-    @cached_property
-    def apart(self) -> _FoundApart:
-        """Rounded ranges or locked disparities."""
-        return _FoundApart.of(self.given)
-
-    @cached_property
-    def part(self) -> Residuals:
-        """The residuals, with the variance of rounding or locking added to the predicted one."""
-        return with_added_variance(self.given.part, self.apart.variance)
-
-    @cached_property
-    def noise(self) -> _FittedNoise:
-        """Noise terms beside no systematic effect."""
-        return _FittedNoise.of(self.given, self.part, WallCells.over(self.part.wall_xy), self.given.registered(self.part))
-
-    @cached_property
-    def search(self) -> SearchInput:
-        """Input of all searches for systematic effects."""
-        families = _families(self.given, self.part, self.apart)
-        terms_at = partial(_noise_terms_at, self.given, self.part)
-        return SearchInput(self.given.measurement, self.part, families, terms_at, self.apart.variance, self.given.random)
-
-    @cached_property
-    def first(self) -> MeanSearch:
-        """The linearised search."""
-        known = [] if self.given.grid_noise is None else [self.given.grid_noise]
-        weighted = with_fitted_variance(self.part, self.noise.terms or known, self.apart.noise_ratio)
-        return MeanSearch(weighted, self.search.families, self.given.random)
+    @classmethod
+    def of(cls, given: SelectionInput) -> SelectionStart:
+        """Search the effects that are found before all others, and set up the linearised search of the rest."""
+        tiles = _shifted_tiles(given)
+        given = given if tiles is None else _beside_tiles(given, tiles)
+        apart = _FoundApart.of(given)
+        part = with_added_variance(given.part, apart.variance)
+        noise = _FittedNoise.of(given, part, WallCells.over(part.wall_xy), given.registered(part))
+        while wrong := noise.implausible(given.measurement):
+            given = given.without(wrong)
+            noise = _FittedNoise.of(given, part, WallCells.over(part.wall_xy), given.registered(part))
+        families = _families(given, part, apart)
+        terms_at = partial(_noise_terms_at, given, part)
+        known = [] if given.grid_noise is None else [given.grid_noise]
+        first = MeanSearch(with_fitted_variance(part, noise.terms or known, apart.noise_ratio), families, given.random)
+        search = SearchInput(given.measurement, part, families, terms_at, apart.variance, given.random)
+        return cls(given, tiles, apart, noise, search, first)
 
     def outline(self) -> list[NamedEffect]:
         """Return the effects that the linearised search selects, refitted together without linearising.
@@ -193,12 +186,12 @@ class SelectionStart:
         They may be the wrong ones, but together they explain most of what is systematic in the residuals. That suffices to search
         effects at depth steps beside them, and takes much less time than `select_effects`.
         """
-        if self.tiles is not None:
-            return [self.tiles]
-        return [*self.apart.named, *(effect_from_estimate(each, self.part) for each in outline_effects(self.search, self.first))]
+        apart = [*self.apart.named] if self.tiles is None else [self.tiles, *self.apart.named]
+        estimates = outline_effects(self.search, self.first)
+        return [*apart, *(effect_from_estimate(each, self.search.part) for each in estimates)]
 
 
-def select_effects(given: SelectionInput, start: SelectionStart | None = None) -> tuple[list[NamedEffect], SelectionResult]:
+def select_effects(start: SelectionStart) -> tuple[list[NamedEffect], SelectionResult]:
     """Find the systematic sensor errors and noise terms that explain the residuals of a measurement (forward selection).
 
     A linearised search finds systematic effects. They are put into the sensor model, residuals are computed again, and further
@@ -206,33 +199,38 @@ def select_effects(given: SelectionInput, start: SelectionStart | None = None) -
     weight the next search. If the fitted value of an effect is implausible, the effect is excluded, and the selection is
     repeated. The effects that were found are returned, and the scores and tests of the selection.
 
-    given : residuals of the training points, and what is not tried. start: the linearised search of this input, if it was made
-    before.
+    start : the linearised search, made from the residuals of the training points.
     """
-    start = start or SelectionStart(given)
-    if start.tiles is not None:
-        return _select_beside_tiles(given, start.tiles)
-    measurement, part, noise = given.measurement, start.part, start.noise
-    if wrong := noise.implausible(measurement):
-        return select_effects(given.without(wrong))
-    search, first = start.search, start.first
-    found = select_and_refit(search, first)
-    wrong = out_of_bounds(measurement, found.estimates, found.residuals)
+    named, result = _select_effects(start)
+    if (tiles := start.tiles) is None:
+        return named, result
+
+    def beside(kept: frozenset[str]) -> float | None:
+        return result.p_value_given([each for each in named if each.name in kept]) if tiles.name in kept else None
+
+    return [tiles, *named], replace(result, systematic=result.systematic | {tiles.name}, p_value_beside=beside)
+
+
+def _select_effects(start: SelectionStart) -> tuple[list[NamedEffect], SelectionResult]:
+    """Select effects beside the tiles that are in the model."""
+    given, search, noise = start.given, start.search, start.noise
+    found = select_and_refit(search, start.first)
+    wrong = out_of_bounds(given.measurement, found.estimates, found.residuals)
     design = found.search.design
     left = design.residuals_after([each.candidate for each in found.further])
     if found.chosen and not wrong:
         noise = _FittedNoise.of(given, found.residuals, design.cells, left)
     if not noise.terms:
-        refound, noise = _with_grid_noise(given, part, found, left, noise)
+        refound, noise = _with_grid_noise(given, search.part, found, left, noise)
         if refound is not None:
-            return select_effects(replace(given, grid_noise=refound))
-    if wrong := (wrong | noise.implausible(measurement)) - given.excluded:
-        return select_effects(given.without(wrong))
+            return _select_effects(SelectionStart.of(replace(given, grid_noise=refound)))
+    if wrong := (wrong | noise.implausible(given.measurement)) - given.excluded:
+        return _select_effects(SelectionStart.of(given.without(wrong)))
     found = with_classes_at_fit(search, found)
     systematic = [effect_from_estimate(each, found.residuals) for each in found.estimates]
-    names = frozenset(item.name for item in systematic)
-    result = _result(given, search, first, found, noise, left, names, start.apart.locking)
-    return [*start.apart.named, *systematic, *(effect_from_variance(each, part.sensor) for each in noise.terms)], result
+    result = _result(start, found, noise, left, frozenset(item.name for item in systematic))
+    noise_terms = (effect_from_variance(each, given.part.sensor) for each in noise.terms)
+    return [*start.apart.named, *systematic, *noise_terms], result
 
 
 def _shifted_tiles(given: SelectionInput) -> NamedEffect | None:
@@ -335,21 +333,14 @@ def _with_grid_noise(
 
 
 def _result(
-    given: SelectionInput,
-    search: SearchInput,
-    first: MeanSearch,
-    found: SearchOutcome,
-    noise: _FittedNoise,
-    left: FloatArray,
-    systematic: frozenset[str],
-    locking: Locking | None,
+    start: SelectionStart, found: SearchOutcome, noise: _FittedNoise, left: FloatArray, systematic: frozenset[str]
 ) -> SelectionResult:
     """Return the scores and tests of a selection.
 
-    left: (n,) residuals after its systematic effects; systematic: their names; locking: the pixel locking that was found.
+    left: (n,) residuals after its systematic effects; systematic: their names.
     """
-    design, sensor = found.search.design, given.part.sensor
-    tiles = _unequal_tiles(given, locking, found, left)
+    given, first, design = start.given, start.first, found.search.design
+    tiles = _unequal_tiles(given, start.apart.locking, found, left)
     p_without_effects = first.goodness_of_fit_p_value(first.score_families(())) if found.estimates else found.p_value
     names, cosines, survival = first.design.identifiability
     tried = found.chosen[0].family_scores if found.chosen else found.tried
@@ -369,13 +360,13 @@ def _result(
             *notes_on_outcome(found, given.part),
         ),
         identifiability={
-            "names": [f"{sensor}.{name}" for name in names],
+            "names": [f"{given.part.sensor}.{name}" for name in names],
             "cosines": cosines.tolist(),
             "survival": survival.tolist(),
         },
         reference_sigma=design.reference_sigma([each.candidate for each in found.further]),
         detectable=lambda: _detectable_sizes(found, [each.effect for each in noise.terms], left, given.random),
-        p_value_beside=cache(lambda kept: _smaller_p_value(_p_value_beside(search, found, kept), tiles)),
+        p_value_beside=cache(lambda kept: _smaller_p_value(_p_value_beside(start.search, found, kept), tiles)),
     )
 
 
@@ -418,14 +409,9 @@ def _detectable_sizes(
     return (*systematic, *tiles, *noise)
 
 
-def _select_beside_tiles(given: SelectionInput, tiles: NamedEffect) -> tuple[list[NamedEffect], SelectionResult]:
-    """Select effects with the shifts of tiles in the model."""
+def _beside_tiles(given: SelectionInput, tiles: NamedEffect) -> SelectionInput:
+    """Return the input of a selection with the shifts of tiles in the model."""
     aligned, found, _ = aligned_with(given.measurement, [tiles], given.part.index)
     at = at_points_of(found, given.part)
     ratio = fit_pose_robustly(at)[2]
-    named, result = select_effects(replace(given, measurement=aligned, part=at, noise_ratio=ratio, noise=None, grid_noise=None))
-
-    def beside(kept: frozenset[str]) -> float | None:
-        return result.p_value_given([each for each in named if each.name in kept]) if tiles.name in kept else None
-
-    return [tiles, *named], replace(result, systematic=result.systematic | {tiles.name}, p_value_beside=beside)
+    return replace(given, measurement=aligned, part=at, noise_ratio=ratio, noise=None, grid_noise=None)

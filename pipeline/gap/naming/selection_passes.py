@@ -170,7 +170,7 @@ class PassInput:
         excluded : effects that are not tried, as pairs (name, whether it is an empirical term).
         """
         noise = None if self.large_effect is None else self.registered_residuals[self.training_rows]
-        return SelectionStart(SelectionInput(*self.training_part, self.noise_ratio, random, excluded, noise))
+        return SelectionStart.of(SelectionInput(*self.training_part, self.noise_ratio, random, excluded, noise))
 
 
 @dataclass(frozen=True)
@@ -301,7 +301,7 @@ def select_beside_edge_effects(inputs: PassInputs, random: KeyedRandom, excluded
         if _names(edge_effects) != before:
             pass_input = inputs.with_these(edge_effects)
             start = pass_input.start(random, excluded)
-    return SelectionPass(pass_input, *select_effects(start.given, start))
+    return SelectionPass(pass_input, *select_effects(start))
 
 
 def subsample_rows(rows: NDArray[np.int64]) -> NDArray[np.int64]:
