@@ -283,8 +283,8 @@ class PassInputs:
 def select_beside_edge_effects(inputs: PassInputs, random: KeyedRandom, excluded: frozenset[tuple[str, bool]]) -> SelectionPass:
     """Search for sensor errors, with those effects at depth steps (edge effects) in the model that the residuals show.
 
-    Other errors can hide or imitate edge effects. These are therefore searched again with the errors in the model that a
-    linearised search finds, before the search proper.
+    Other errors can hide or imitate edge effects, or change their sizes. These are therefore searched again with the errors in
+    the model that a linearised search finds, before the search proper.
 
     Parameters
     ----------
@@ -295,10 +295,10 @@ def select_beside_edge_effects(inputs: PassInputs, random: KeyedRandom, excluded
     pass_input = inputs.with_these(inputs.edge_effects)
     start = pass_input.start(random, excluded)
     if outline := start.outline():
-        before = _names(pass_input.edge_effects)
-        imitated = {Smoothing.tag()} - before  # a small error of the rays' directions looks like smoothing
+        before = [each.effect for each in pass_input.edge_effects]
+        imitated = {Smoothing.tag()} - {each.name for each in before}  # a small error of the rays' directions looks like it
         edge_effects = [each for each in inputs.edge_effects_given(outline) if each.name not in imitated]
-        if _names(edge_effects) != before:
+        if [each.effect for each in edge_effects] != before:
             pass_input = inputs.with_these(edge_effects)
             start = pass_input.start(random, excluded)
     return SelectionPass(pass_input, *select_effects(start))
