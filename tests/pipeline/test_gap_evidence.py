@@ -329,6 +329,37 @@ def test_two_effects_that_explain_more_than_one_cannot_be_told_from_it(pair: flo
     assert named.alternatives == ["stereo.camera_phi", *together]
 
 
+class _TwoPairs(_Scripted):
+    """A search in which two pairs of effects score 60 and 59, other pairs and all larger sets 40; 5 is significant."""
+
+    def __init__(self) -> None:
+        pairs = {frozenset({"collimation", "range_scale"}): 60.0, frozenset({"range_offset", "tilt_drift"}): 59.0}
+
+        def joint(known: set[str]) -> float:
+            return 20.0 * len(known) if len(known) < 2 else pairs.get(frozenset(known), 40.0)
+
+        names = [name for pair in pairs for name in pair]
+        super().__init__(lambda known: {(name, ""): joint(known | {name}) - joint(known) for name in names})
+
+    def p_value(self, score: float) -> float:
+        return 0.001 if score >= 5 else 0.5
+
+
+def test_a_pair_in_place_of_two_effects_says_so() -> None:
+    """Neither effect of the pair that is named could be replaced alone."""
+    chosen, _ = ForwardSelection(_TwoPairs()).select()
+    instead = ("range_offset", "tilt_drift")
+    assert {each.candidate.name: (each.replacing_pair, each.replaced_too) for each in chosen} == {
+        "collimation": (instead, "range_scale"),
+        "range_scale": (instead, "collimation"),
+    }
+    part: Any = SimpleNamespace(sensor="tls")
+    one = next(each for each in chosen if each.candidate.name == "collimation")
+    candidate = replace(one.candidate, matrix=np.zeros((1, 0)))
+    named = effect_from_estimate(Estimate(one, candidate, np.zeros(0), np.zeros((0, 0))), part)
+    assert named.alternatives == ["tls.range_offset together with tls.tilt_drift in place of it and tls.range_scale"]
+
+
 @pytest.mark.parametrize(("places", "named"), [(5.0, {"collimation", "range_scale"}), (75.0, set())])
 def test_a_name_says_more_than_mere_places_do(places: float, named: set[str]) -> None:
     """One effect explains much, a second one something beside it; a step at a place along the wall always explains as much."""

@@ -70,6 +70,7 @@ class SelectedEffect:
         is a non-parametric term, no other effect is in the model.
     replacing_pair : Names of two effects that would score as well together, in its place or in that of it and another selected
         effect; empty if there are none.
+    replaced_too : Name of that other selected effect; "" if the pair replaces this one alone.
     """
 
     candidate: Candidate
@@ -79,6 +80,7 @@ class SelectedEffect:
     score: float
     family_scores: tuple[FamilyScore, ...]
     replacing_pair: tuple[str, ...] = ()
+    replaced_too: str = ""
 
 
 @dataclass(frozen=True)
@@ -133,16 +135,17 @@ def _replacements(names: set[str], name: str, margin: float, scores: SetScores) 
     return [other for each in sorted(as_good, key=lambda each: -scores[each]) for other in each - others if other != name]
 
 
-def _replacing_pair(names: set[str], name: str, margin: float, scores: SetScores) -> tuple[str, ...]:
-    """Return the two effects that best replace `name`, or `name` and another effect of the set `names`; empty if none do.
+def _replacing_pair(names: set[str], name: str, margin: float, scores: SetScores) -> tuple[tuple[str, ...], str]:
+    """Return the two effects that best replace `name`, or `name` and another effect of the set `names`, and that other effect.
 
-    The joint score must be nearly the same for as many effects, and higher for one effect more.
+    The joint score must be nearly the same for as many effects, and higher for one effect more. Empty if none do.
     """
     joint = scores.get(frozenset(names), math.inf)
     least = {len(names): joint - margin, len(names) + 1: joint}
     sets = (each for each in scores if name not in each and len(each - names) == 2)
     as_good = [each for each in sets if scores[each] > least.get(len(each), math.inf)]
-    return tuple(sorted(max(as_good, key=lambda each: scores[each]) - names)) if as_good else ()
+    best = max(as_good, key=lambda each: scores[each], default=names)
+    return tuple(sorted(best - names)), "".join(names - best - {name})
 
 
 def _least_nonparametric_score() -> float:
@@ -280,8 +283,8 @@ class ForwardSelection:
         margin = equivalence_margin(ratio)
         alike = [each.name for each in beside if each is not mine and each.score > mine.score - margin]
         alike += _replacements(names | {item.name}, item.name, margin, scores)
-        pair = _replacing_pair(names | {item.name}, item.name, margin, scores)
-        return SelectedEffect(item.candidate, tuple(dict.fromkeys(alike)), p_value, ratio, mine.score, tried, pair)
+        replacing = _replacing_pair(names | {item.name}, item.name, margin, scores)
+        return SelectedEffect(item.candidate, tuple(dict.fromkeys(alike)), p_value, ratio, mine.score, tried, *replacing)
 
     def _significant(self, score: float) -> bool:
         """Tell whether a score is significant."""

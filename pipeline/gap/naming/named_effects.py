@@ -60,6 +60,7 @@ class NamedEffect:
     split_by : further measurement that would tell it from those in `indistinguishable`, in words; "" if there are none.
     replacing_pair : names of two effects that together explain the measurement as well, in place of this one, or of this one
         and another named one; they are among the indistinguishable ones. Empty if there are none.
+    replaced_too : name of that other effect; "" if the pair would replace this one alone.
     only_together : those of the pair that do not explain the measurement as well without the other one.
     """
 
@@ -72,13 +73,17 @@ class NamedEffect:
     gain: float
     split_by: str = ""
     replacing_pair: tuple[str, ...] = ()
+    replaced_too: str = ""
     only_together: tuple[str, ...] = ()
 
     @property
     def alternatives(self) -> list[str]:
         """Explanations that fit this measurement as well, in words: an effect's name, or two joined by "together with"."""
-        single = [name for name in self.indistinguishable if name not in self.only_together]
-        return [*single, *filter(None, [" together with ".join(self.replacing_pair)])]
+        found = [name for name in self.indistinguishable if name not in self.only_together]
+        if self.replacing_pair:
+            instead = f" in place of it and {self.replaced_too}" if self.replaced_too else ""
+            found.append(" together with ".join(self.replacing_pair) + instead)
+        return found
 
     @property
     def effect(self) -> type[Effect]:
@@ -312,7 +317,12 @@ def effect_from_estimate(found: Estimate, part: Residuals) -> NamedEffect:
     alike = dict.fromkeys([*item.indistinguishable, *item.replacing_pair])
     named = _named(part.sensor, entry, std, ratio, alike=alike, p_value=p_value)
     pair = {f"{part.sensor}.{name}": name in item.indistinguishable for name in item.replacing_pair}
-    return replace(named, replacing_pair=tuple(pair), only_together=tuple(name for name, alone in pair.items() if not alone))
+    return replace(
+        named,
+        replacing_pair=tuple(pair),
+        replaced_too=f"{part.sensor}.{item.replaced_too}" if item.replaced_too else "",
+        only_together=tuple(name for name, alone in pair.items() if not alone),
+    )
 
 
 def _standard_deviations(candidate: Candidate, values: FloatArray, covariance: FloatArray) -> dict[str, float]:
