@@ -25,7 +25,7 @@ from pipeline.gap.noise_and_edges import disparity_edges, variance_model
 
 STEPS: dict[str, tuple[Any, str, Any]] = {
     "each effect is tried alone": (nonlinear_refit, "_screened_single_fits", lambda given, first, alone: alone),
-    "relinearised selection": (nonlinear_refit, "_relinearised", lambda given, found: found),
+    "relinearised selection": (nonlinear_refit, "_relinearised", lambda given, linear: (linear, False)),
     "pose beside edge fattening": (workflow, "align_beside_fattening", lambda pair, initial, found, trusted: found),
     "windows of edge fattening": (disparity_edges, "_WINDOWS", ()),
     "edge effects searched again": (effect_selection.SelectionStart, "outline", lambda start: []),

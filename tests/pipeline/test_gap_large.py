@@ -183,7 +183,7 @@ def test_effects_are_tried_one_by_one_where_several_weak_ones_seem_needed(
 
     monkeypatch.setattr(nonlinear_refit, "_search_beside_best", beside_best)
     monkeypatch.setattr(nonlinear_refit, "_search_beside", lambda *_: None)
-    monkeypatch.setattr(nonlinear_refit, "_relinearised", lambda _, linear: replace(linear, chosen=[]))
+    monkeypatch.setattr(nonlinear_refit, "_relinearised", lambda _, linear: (replace(linear, chosen=[]), False))
     for fewer in (0, 1):
         found = select_and_refit(points, first)
         assert (found is tried[-1]) == (fewer > 0)

@@ -28,7 +28,7 @@ from pipeline.gap.residuals.residuals import BoolArray, Residuals
 from pipeline.gap.thresholds import equivalence_margin, thresholds
 from scene.geometry.mesh import FloatArray
 
-_MOST_CONVERGED, _MOST_ROUNDS, _CONVERGED_GAIN, _MOST_SELECTIONS = 3, 8, 1.0, 4
+_MOST_CONVERGED, _MOST_ROUNDS, _CONVERGED_GAIN, _MOST_SELECTIONS = 3, 8, 1.0, 3
 """Number of effects that are refitted to convergence, largest number of iterations, gain of log-likelihood that ends them, and
 most selections that are repeated with new derivatives."""
 _ABSORBED_SHARE = 0.5
@@ -178,7 +178,8 @@ def select_and_refit(given: SearchInput, first: MeanSearch) -> SearchOutcome:
     best = beside_best if beside_best is not None and _within_bounds(given, beside_best) else None
     best = _simpler(given, best, linear, ties=not alone)
     if best is None or best.complexity > (0, 1):
-        best = _simpler(given, best, _relinearised(given, linear), ties=True)
+        relinearised, complete = _relinearised(given, linear)
+        best = _simpler(given, best, relinearised, ties=True, complete=complete)
     return linear if best is None else best
 
 
@@ -192,16 +193,20 @@ def outline_effects(given: SearchInput, first: MeanSearch) -> list[Estimate]:
     return [] if together is None else [*_converged(given, first, together).estimates]
 
 
-def _relinearised(given: SearchInput, found: SearchOutcome) -> SearchOutcome:
+def _relinearised(given: SearchInput, linear: SearchOutcome) -> tuple[SearchOutcome, bool]:
     """Repeat a selection with derivatives taken at the model that holds its effects, until it selects the same ones again.
 
     This is the Gauss-Newton iteration, with the set of effects free as well as their sizes.
+
+    Returns
+    -------
+    The last selection, and whether it repeats the one before: then it has searched for all effects that it may lack.
     """
-    seen: list[set[str]] = []
+    found, seen = linear, list[set[str]]()
     while (names := {each.candidate.name for each in found.estimates}) not in seen and len(seen) < _MOST_SELECTIONS:
         seen.append(names)
         found = _selected_at_fit(given, found) or found
-    return found
+    return found, found is not linear and names == seen[-1]
 
 
 def _selected_at_fit(given: SearchInput, found: SearchOutcome) -> SearchOutcome | None:
@@ -256,12 +261,15 @@ def _with_class(chosen: SelectedEffect, refitted: SelectedEffect, scores: Mappin
     return replace(chosen, indistinguishable=tuple(sorted(alike)), replacing_pair=())
 
 
-def _simpler(given: SearchInput, best: SearchOutcome | None, other: SearchOutcome, ties: bool) -> SearchOutcome | None:
+def _simpler(
+    given: SearchInput, best: SearchOutcome | None, other: SearchOutcome, ties: bool, complete: bool = False
+) -> SearchOutcome | None:
     """Return the simpler of two explanations of the residuals, after a search for effects that the second one may lack.
 
     That search only adds effects, so it is left out where the second explanation cannot be simpler. One that still leaves a
     misfit, where the first leaves none, is no alternative.
     best: the first explanation; None if there is none. ties: whether the second one is returned if both are equally simple.
+    complete: whether the second one lacks no effect, as was searched before.
     """
     if not other.chosen:
         return best
@@ -271,7 +279,7 @@ def _simpler(given: SearchInput, best: SearchOutcome | None, other: SearchOutcom
 
     if not wins((0, sum(not each.candidate.empirical for each in other.estimates))):
         return best
-    other = _search_beside(given, other) or other
+    other = other if complete else _search_beside(given, other) or other
     if best is not None and other.leaves_more_misfit_than(best):
         return best
     return other if wins(other.complexity) and _within_bounds(given, other) else best
