@@ -147,7 +147,7 @@ class SelectionStart:
 
     Attributes
     ----------
-    given : residuals of the training points, and what is not tried: effects whose noise terms are implausible too.
+    given : input of the selection, in which effects whose noise terms are implausible count as not to be tried.
     tiles : shifts of a stereo matcher's tiles, which are in the sensor model of `given`; None without.
     apart : rounded ranges or locked disparities.
     noise : noise terms beside no systematic effect.
