@@ -31,12 +31,12 @@ _BLOCKS = 64
 """Such groups of rows that a thread takes at a time."""
 _FEWEST = 100
 """Fewest points for outliers to be rejected."""
-_RETRACE_FROM_SIGMAS, _MOST_MOVES, _MOST_MOVES_OF_SURFACES = 0.1, 3, 12
-"""A pose that changes the residuals by more than this, in predicted sigmas averaged over the points, needs new residuals; and
-how often that is repeated at most. A surface without cameras takes more moves: its nearest places on the reference change.
+_RETRACE_FROM_SIGMAS, _RETRACE_FROM_M, _MOST_MOVES = 0.02, 0.002, 3
+"""A pose that changes the residuals by more than this, in predicted sigmas averaged over the points, and rays by more than this
+on the wall, m, needs new residuals; and how often that is repeated at most.
 """
-_RETRACE_FROM_M = 0.002
-"""Rays must also move by more than this on the wall, m, to be traced again."""
+_RENEW_FROM_SIGMAS, _MOST_MOVES_OF_SURFACES = 0.1, 12
+"""The same for a surface without cameras: its nearest places on the reference change as it moves."""
 
 
 def fit_pose_robustly(residuals: Residuals) -> tuple[FloatArray, FloatArray, float]:
@@ -198,9 +198,9 @@ def align(
 ) -> AlignedMeasurement:
     """Move the sensor to the pose that fits the residuals best, and compute the residuals there.
 
-    The fit is linear in the pose. The residuals are therefore computed again, and the fit is repeated, after a larger move: one
-    that changes them by more than a tenth of their predicted standard deviations on average, and rays by more than 2 mm on the
-    wall. This is repeated up to three times, or twelve times for a cloud without cameras.
+    The fit is linear in the pose. After a larger move the residuals are therefore computed again and the fit is repeated: if
+    it changes them by more than 2 % of their predicted standard deviations on average, and rays by more than 2 mm on the wall, up
+    to three times. For a cloud without cameras: if it changes them by more than a tenth, up to twelve times.
 
     Parameters
     ----------
@@ -231,10 +231,11 @@ def align(
 
 def _moves_far(pose: FloatArray, residuals: Residuals) -> bool:
     """Tell whether a pose moves the sensor so far that the residuals must be computed again."""
-    if np.mean(np.abs(residuals.pose_jacobian @ pose) / residuals.sigma) <= _RETRACE_FROM_SIGMAS:
-        return False
+    change = float(np.mean(np.abs(residuals.pose_jacobian @ pose) / residuals.sigma))
     if isinstance(residuals, SurfaceResiduals):
-        return True
+        return change > _RENEW_FROM_SIGMAS
+    if change <= _RETRACE_FROM_SIGMAS:
+        return False
     for start in range(0, len(pose), 6):
         own, columns = pose[start : start + 6], residuals.pose_jacobian[:, start : start + 6]
         turn, shift = (float(np.linalg.norm(columns[:, part], axis=1).mean()) for part in (slice(3, 6), slice(3)))
