@@ -16,7 +16,7 @@ from pipeline.change.robust import nmad
 from pipeline.formats.measurements.measurement import Measurement, StereoMeasurement, SurfaceMeasurement
 from pipeline.gap.residuals.residuals import BoolArray, Residuals
 from pipeline.gap.residuals.several_scans import residuals_of_scans
-from pipeline.gap.residuals.stereo_residuals import stereo_residuals
+from pipeline.gap.residuals.stereo_residuals import StereoResiduals, stereo_residuals
 from pipeline.gap.residuals.surface_residuals import SurfaceResiduals, surface_residuals
 from pipeline.gap.residuals.tls_residuals import tls_residuals
 from pipeline.gap.thresholds import thresholds
@@ -31,12 +31,13 @@ _BLOCKS = 64
 """Such groups of rows that a thread takes at a time."""
 _FEWEST = 100
 """Fewest points for outliers to be rejected."""
-_RETRACE_FROM_SIGMAS, _RETRACE_FROM_M, _MOST_MOVES = 0.02, 0.002, 3
-"""A pose that changes the residuals by more than this, in predicted sigmas averaged over the points, and rays by more than this
-on the wall, m, needs new residuals; and how often that is repeated at most.
-"""
-_RENEW_FROM_SIGMAS, _MOST_MOVES_OF_SURFACES = 0.1, 12
-"""The same for a surface without cameras: its nearest places on the reference change as it moves."""
+_RETRACE_FROM_M, _MOST_MOVES = 0.002, 3
+"""A pose that moves rays by more than this on the wall, m, needs new residuals; and how often that is repeated at most."""
+_RETRACE_PAIR_FROM_SIGMAS = 0.02
+"""For a stereo pair it must also change them by more than this, in predicted sigmas averaged over the points: shift and rotation of
+a distant pair nearly cancel."""
+_RETRACE_FROM_SIGMAS, _MOST_MOVES_OF_SURFACES = 0.1, 12
+"""The same for a surface without cameras, where only this counts: its nearest places on the reference change as it moves."""
 
 
 def fit_pose_robustly(residuals: Residuals) -> tuple[FloatArray, FloatArray, float]:
@@ -199,8 +200,9 @@ def align(
     """Move the sensor to the pose that fits the residuals best, and compute the residuals there.
 
     The fit is linear in the pose. After a larger move the residuals are therefore computed again and the fit is repeated: if
-    it changes them by more than 2 % of their predicted standard deviations on average, and rays by more than 2 mm on the wall, up
-    to three times. For a cloud without cameras: if it changes them by more than a tenth, up to twelve times.
+    rays move by more than 2 mm on the wall, up to three times; for a stereo pair only if disparities also change by more than 2 %
+    of their predicted standard deviations on average. For a cloud without cameras: if the points move by more than a tenth of
+    their predicted standard deviations on average, up to twelve times.
 
     Parameters
     ----------
@@ -233,8 +235,8 @@ def _moves_far(pose: FloatArray, residuals: Residuals) -> bool:
     """Tell whether a pose moves the sensor so far that the residuals must be computed again."""
     change = float(np.mean(np.abs(residuals.pose_jacobian @ pose) / residuals.sigma))
     if isinstance(residuals, SurfaceResiduals):
-        return change > _RENEW_FROM_SIGMAS
-    if change <= _RETRACE_FROM_SIGMAS:
+        return change > _RETRACE_FROM_SIGMAS
+    if isinstance(residuals, StereoResiduals) and change <= _RETRACE_PAIR_FROM_SIGMAS:
         return False
     for start in range(0, len(pose), 6):
         own, columns = pose[start : start + 6], residuals.pose_jacobian[:, start : start + 6]
