@@ -136,9 +136,10 @@ def _replacements(names: set[str], name: str, margin: float, scores: SetScores) 
 
 
 def _replacing_pair(names: set[str], name: str, margin: float, scores: SetScores) -> tuple[tuple[str, ...], str]:
-    """Return the two effects that best replace `name`, or `name` and another effect of the set `names`, and that other effect.
+    """Find the two effects that best replace `name` in the set `names`, alone or together with another effect of the set.
 
-    The joint score must be nearly the same for as many effects, and higher for one effect more. Empty if none do.
+    The joint score must be nearly the same for as many effects, and higher for one effect more. The two effects are returned, and
+    the other effect that they replace too; both are empty if there is none.
     """
     joint = scores.get(frozenset(names), math.inf)
     least = {len(names): joint - margin, len(names) + 1: joint}

@@ -184,9 +184,9 @@ def select_and_refit(given: SearchInput, first: MeanSearch) -> SearchOutcome:
 
 
 def outline_effects(given: SearchInput, first: MeanSearch) -> list[Estimate]:
-    """Refit the effects of the catalogue that a linearised search selects, together and without linearising.
+    """Fit the effects of the catalogue that a linearised search selects once more: jointly, and with the full sensor model.
 
-    None are returned if a sensor model does not accept them, or if too few rays meet the reference with them.
+    The list is empty if the sensor model does not accept their sizes, or if too few rays meet the reference with them.
     """
     estimates = [each for each in estimates_of(first, first.select()[0]) if not each.candidate.empirical]
     together = _Refit.of(given, first, estimates) if estimates else None

@@ -34,8 +34,9 @@ _FEWEST = 100
 _RETRACE_FROM_M, _MOST_MOVES = 0.002, 3
 """A pose that moves rays by more than this on the wall, m, needs new residuals; and how often that is repeated at most."""
 _RETRACE_PAIR_FROM_SIGMAS = 0.02
-"""For a stereo pair it must also change them by more than this, in predicted sigmas averaged over the points: shift and rotation
-of a distant pair nearly cancel."""
+"""A stereo pair's pose must also change the disparities by more than this, in predicted standard deviations averaged over the
+points: a shift and a rotation of a distant pair can nearly cancel, so that their sizes alone say little.
+"""
 _RETRACE_FROM_SIGMAS, _MOST_MOVES_OF_SURFACES = 0.1, 12
 """The same for a surface without cameras, where only this counts: its nearest places on the reference change as it moves."""
 
