@@ -346,7 +346,7 @@ class _TwoPairs(_Scripted):
 
 
 def test_a_pair_in_place_of_two_effects_says_so() -> None:
-    """Neither effect of the pair that is named could be replaced alone."""
+    """No single effect can replace one of the two that are named; only another pair can replace both."""
     chosen, _ = ForwardSelection(_TwoPairs()).select()
     instead = ("range_offset", "tilt_drift")
     assert {each.candidate.name: (each.replacing_pair, each.replaced_too) for each in chosen} == {

@@ -28,7 +28,7 @@ from pipeline.gap.naming.selection_passes import PassInput, PassInputs, select_b
 from pipeline.gap.naming.validation_scores import ValidatedEffects
 from pipeline.gap.noise_and_edges.edge_effects import EdgeEffect
 from pipeline.gap.noise_and_edges.variance_model import VarianceTerm
-from pipeline.gap.residuals.alignment import align, at_points_of, compute_residuals
+from pipeline.gap.residuals.alignment import _moves_far, align, at_points_of, compute_residuals
 from pipeline.gap.residuals.disparity_raster import DisparityRaster
 from pipeline.gap.residuals.nominal_pair import NominalPair, real_pair
 from pipeline.gap.residuals.stereo_residuals import StereoResiduals, stereo_residuals
@@ -230,7 +230,7 @@ def _smoothed_disparities(tmp_path: Path) -> StereoMeasurement:
 
 
 def _training_part(measurement: StereoMeasurement) -> tuple[StereoMeasurement, StereoResiduals, NDArray[np.int64]]:
-    """The part of a measurement from which effects are selected, its residuals, and its row numbers in the measurement.
+    """Return the points from which effects are selected: their measurement, residuals, and row numbers in the whole measurement.
 
     No point is kept for validation.
     """
@@ -245,7 +245,7 @@ def _training_part(measurement: StereoMeasurement) -> tuple[StereoMeasurement, S
 def test_what_a_low_pass_does_is_kept_for_a_search_on_a_large_raster(
     smoothed_disparities: StereoMeasurement, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """It is taken from the whole raster, including points that miss the reference, and is passed on to all trials."""
+    """What the low-pass changes is computed once, on the whole raster, and every trial of another error uses it."""
     monkeypatch.setattr(selection_passes, "_MOST_CELLS", 1000)
     part, residuals, _ = _training_part(smoothed_disparities)
     found = compute_residuals(part).value
@@ -272,6 +272,16 @@ def test_what_a_low_pass_does_follows_the_rays_that_another_error_moves(smoothed
     assert len(here) > 1000
     assert np.nanstd(before - expected) > 0.1 * np.nanstd(expected), "the rays see other rock"
     assert np.mean(np.abs(here.geometry.shaped - expected) < 0.02 * np.nanstd(expected)) > 0.9
+
+
+def test_a_pairs_rays_are_not_traced_again_where_shift_and_turn_cancel(smoothed_disparities: StereoMeasurement) -> None:
+    """The move that changes disparities least is a shift and a turn; its size on the wall alone would call for new rays."""
+    found = stereo_residuals(smoothed_disparities)
+    relative = found.pose_jacobian / found.sigma[:, None]
+    least = np.linalg.svd(relative, full_matrices=False)[2][-1]
+    pose = least * 0.019 / np.mean(np.abs(relative @ least))
+    assert not _moves_far(pose, found)
+    assert _moves_far(1.1 * pose, found), "now they change by more than 2 % of sigma"
 
 
 @pytest.mark.parametrize(("beside", "kept"), [(["smoothing", "edge_fattening"], True), (["edge_fattening"], False), ([], False)])

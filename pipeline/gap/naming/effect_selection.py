@@ -164,7 +164,7 @@ class SelectionStart:
 
     @classmethod
     def of(cls, given: SelectionInput) -> SelectionStart:
-        """Search the effects that are found before all others, and set up the linearised search of the rest."""
+        """Find shifted tiles, rounding, locking and noise, and set up the linearised search for all other effects."""
         tiles = _shifted_tiles(given)
         given = given if tiles is None else _beside_tiles(given, tiles)
         apart = _FoundApart.of(given)
@@ -181,7 +181,7 @@ class SelectionStart:
         return cls(given, tiles, apart, noise, search, first)
 
     def outline(self) -> list[NamedEffect]:
-        """Return the effects that the linearised search selects, refitted together without linearising.
+        """Return the effects that the linearised search selects, fitted once more: jointly, and with the full sensor model.
 
         They may be the wrong ones, but together they explain most of what is systematic in the residuals. That suffices to search
         effects at depth steps beside them, and takes much less time than `select_effects`.
@@ -212,7 +212,7 @@ def select_effects(start: SelectionStart) -> tuple[list[NamedEffect], SelectionR
 
 
 def _select_effects(start: SelectionStart) -> tuple[list[NamedEffect], SelectionResult]:
-    """Select effects beside the tiles that are in the model."""
+    """Select effects; shifted tiles that were found are in the sensor model already."""
     given, search, noise = start.given, start.search, start.noise
     found = select_and_refit(search, start.first)
     wrong = out_of_bounds(given.measurement, found.estimates, found.residuals)
@@ -410,7 +410,7 @@ def _detectable_sizes(
 
 
 def _beside_tiles(given: SelectionInput, tiles: NamedEffect) -> SelectionInput:
-    """Return the input of a selection with the shifts of tiles in the model."""
+    """Put the shifts of tiles into the sensor model, and return the input of a selection with the residuals that are left."""
     aligned, found, _ = aligned_with(given.measurement, [tiles], given.part.index)
     at = at_points_of(found, given.part)
     ratio = fit_pose_robustly(at)[2]

@@ -41,7 +41,7 @@ from sensors.effects.smoothing import Smoothing
 _MOST_POINTS = 60_000
 """Most points that a selection uses; more add little information to about 800 cells."""
 _MOST_CELLS = 400_000
-"""Most cells of a raster of pixels on which edge effects are simulated anew for each trial of another error (0.4 s)."""
+"""Largest pixel raster, in cells, on which edge effects are computed anew when another error is tried. It takes 0.4 s then."""
 
 
 @dataclass(frozen=True)
@@ -162,7 +162,7 @@ class PassInput:
         return subsample(measurement, residuals, self.training_rows)
 
     def start(self, random: KeyedRandom, excluded: frozenset[tuple[str, bool]]) -> SelectionStart:
-        """Prepare the search for sensor errors (effects).
+        """Set up the linearised search for sensor errors (effects), with which a selection starts.
 
         Parameters
         ----------
