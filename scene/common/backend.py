@@ -7,6 +7,8 @@ from __future__ import annotations
 
 import os
 import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 
 from scene.common.errors import InputError
 
@@ -58,4 +60,20 @@ def _activate() -> str:
 
 VARIANT = _activate()
 
-__all__ = ["CUDA", "LLVM", "VARIANT", "dr", "mi"]
+
+@contextmanager
+def limited_threads(most: int | None) -> Iterator[None]:
+    """Let the ray tracer use at most `most` threads on the CPU inside a `with` block; None: no limit.
+
+    A thread of the ray tracer that waits for the next task keeps a processor core busy, so that many short tasks cost less time
+    of the processors with one thread, and take as long. Results do not depend on the number of threads.
+    """
+    before = dr.thread_count()
+    dr.set_thread_count(before if most is None else min(most, before))
+    try:
+        yield
+    finally:
+        dr.set_thread_count(before)
+
+
+__all__ = ["CUDA", "LLVM", "VARIANT", "dr", "limited_threads", "mi"]

@@ -58,6 +58,7 @@ from pipeline.gap.residuals.surface_residuals import SurfaceResiduals
 from pipeline.gap.residuals.tls_residuals import TlsResiduals, find_expected_pulses, with_scan_order
 from pipeline.gap.residuals.wall_blocks import BlockGrid, WallCells
 from pipeline.gap.thresholds import Thresholds, thresholds, use_thresholds
+from scene.common.backend import limited_threads
 from scene.common.keyed_random import KeyedRandom
 from scene.geometry.mesh import FloatArray
 from sensors.effects.occlusion_fill import OcclusionFill
@@ -65,6 +66,8 @@ from sensors.models.sensor_model import StereoModel, TlsModel
 
 STEPS = {"residuals": 3.0, "naming": 14.0, "validation": 2.0}
 """Steps of `diagnose`, and roughly how long each takes, s."""
+_FEW_POINTS = 200_000
+"""Most points for which the ray tracer gets one thread: its tasks are then so short that a second one would mostly wait."""
 _DEFAULTS = Thresholds()
 _LEAST_MODEL_SHARE = 0.1
 """Least share of its standard deviation that a model keeps where the reference error explains all of the noise."""
@@ -159,7 +162,8 @@ def diagnose(
     """
     clock, random = _Clock(progress), KeyedRandom(seed, ("gap",))
     # one BLAS thread: results do not depend on the number of threads, and no threads wait for each other
-    with use_thresholds(thresholds), threadpool_limits(1, "blas"):
+    few = len(measurement.cloud.points) <= _FEW_POINTS
+    with use_thresholds(thresholds), threadpool_limits(1, "blas"), limited_threads(1 if few else None):
         part, rows = subsample_measurement(prepared(measurement), random.child("thinned"))
         found = _diagnose(part, clock, random)
     return replace(found, residuals=replace(found.residuals, index=rows[found.residuals.index]))
