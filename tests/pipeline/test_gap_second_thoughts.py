@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from benchmarks.gap_closed_form.cases import Case, make
 from pipeline.formats.measurements.measurement import StereoMeasurement, read_measurement
 from pipeline.gap.mean.nonparametric_terms import SPATIAL_NULL
-from pipeline.gap.naming import selection_passes, workflow
+from pipeline.gap.naming import nonlinear_refit, selection_passes, workflow
 from pipeline.gap.naming.effect_selection import NONPARAMETRIC_TERMS
 from pipeline.gap.naming.gap_score import simulate_errors
 from pipeline.gap.naming.named_effects import NamedEffect, with_effects
@@ -294,3 +294,29 @@ def test_smoothing_must_also_show_beside_the_effect_that_makes_residuals_smalles
     inputs: Any = SimpleNamespace(large_effect=None, _best_single_effect="camera_phi", measurement=None, plain=None)
     inputs.held_out_points, inputs._edge_effects_beside = None, lambda effects, _: then if effects == ["camera_phi"] else []
     assert PassInputs.edge_effects.func(inputs) is (first if kept else then)
+
+
+@pytest.mark.parametrize(
+    ("selections", "kept", "complete"),
+    [
+        (["ab", "ab"], 1, True),
+        (["ab", "ac", "ac"], 2, True),
+        (["ab", "ac", "ab"], 2, False),  # it goes round in a circle
+        (["ab", "ac", "ad", "ae"], 3, False),  # each one differs, and no more are made
+        (["ab", ""], 0, False),  # the model cannot hold the effects
+    ],
+)
+def test_a_selection_is_repeated_until_it_selects_the_same_again(
+    monkeypatch: pytest.MonkeyPatch, selections: list[str], kept: int, complete: bool
+) -> None:
+    """Only then has it searched for all effects that it may lack. Each letter is the name of an effect."""
+
+    def selected(names: str) -> Any:
+        return SimpleNamespace(estimates=[SimpleNamespace(candidate=SimpleNamespace(name=name)) for name in names])
+
+    given: Any = None
+    outcomes = [selected(names) if names else None for names in selections]
+    left = iter(outcomes[1:])
+    monkeypatch.setattr(nonlinear_refit, "_selected_at_fit", lambda *_: next(left))
+    assert nonlinear_refit._relinearised(given, outcomes[0]) == (outcomes[kept], complete)
+    assert next(left, None) is None

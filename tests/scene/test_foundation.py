@@ -15,7 +15,7 @@ from pydantic import Field
 from scipy import stats
 from surfaces import heightfield, plane, sphere
 
-from scene.common.backend import dr, mi
+from scene.common.backend import dr, limited_threads, mi
 from scene.common.config import Config, load_yaml, parse
 from scene.common.errors import InputError
 from scene.common.keyed_random import KeyedRandom
@@ -336,3 +336,17 @@ def test_a_wrong_variant_is_an_input_error() -> None:
     environment = {"SCARPSIM_VARIANT": "vulkan", "PYTHONPATH": str(Path(__file__).parents[2]), "PATH": "/usr/bin"}
     result = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=False)
     assert "allowed: cuda_ad_mono, llvm_ad_mono" in result.stderr
+
+
+@pytest.mark.parametrize(("most", "fewer"), [(1, True), (1_000, False), (None, False)])
+def test_the_ray_tracer_gets_its_threads_back_after_an_error(most: int | None, fewer: bool) -> None:
+    """A limit above their number changes nothing."""
+
+    @limited_threads(most)
+    def fail() -> None:
+        raise InputError(str(dr.thread_count()), where="here", remedy="none")
+
+    before = dr.thread_count()
+    with pytest.raises(InputError, match=f"{1 if fewer else before}"):
+        fail()
+    assert dr.thread_count() == before
