@@ -17,7 +17,7 @@ from scene.geometry.mesh import FloatArray
 from sensors.effects.matching_noise import MatchingNoise, NodeNoise
 from sensors.signal_chain.node_grid import MEAN_VARIANCE
 
-_MOST_NODES = 1600
+_MOST_NODES = 2500
 """Most nodes. A finer grid is replaced by a coarser one with the same power at long wavelengths."""
 _SAMPLE = 500
 """Points over which the variance is averaged."""
