@@ -44,7 +44,9 @@ class Parser(argparse.ArgumentParser):
                 raise InputError(problem, where=self.prog, remedy="give the argument a value; a shell variable may be empty")
         arguments, unknown = self.parse_known_args(words)
         if unknown:
-            raise InputError(f"unexpected argument '{unknown[0]}'", where=self.prog, remedy=self._see_help)
+            is_config = "--config" in flags and unknown[0].endswith((".yaml", ".yml"))
+            remedy = f"give the config as --config {unknown[0]}" if is_config else self._see_help
+            raise InputError(f"unexpected argument '{unknown[0]}'", where=self.prog, remedy=remedy)
         return arguments
 
     @property

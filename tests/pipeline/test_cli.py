@@ -118,7 +118,8 @@ MISTAKES = [
     ([*SIMULATE, "--threads", "0"], "allowed: a whole number from 1"),
     (["completion", "powershell"], "allowed: bash, zsh, fish"),
     (["schema", "simulatoin"], "did you mean 'simulation'?"),
-    ([*SIMULATE, "more.yaml"], "unexpected argument 'more.yaml'"),
+    ([*SIMULATE, "more.yaml"], "unexpected argument 'more.yaml'; give the config as --config more.yaml"),
+    ([*SIMULATE, "more.txt"], "unexpected argument 'more.txt'; see scarpsim simulate --help"),
     (["simulate", "--sensor", "tls", "--resume"], "add --out DIR"),
     (["doctor", "--jsno"], "did you mean '--json'?"),
 ]
