@@ -107,18 +107,13 @@ def validate_effects(
         known = np.isfinite(with_all.value) & np.isfinite(without.value)
         return _log_score_gains(with_all, without, known & ~training, residuals.wall_xy, block, patch_sigma)
 
-    beside = len(named) > 1
-    return _sorted_by_gain(named, gains, beside) if (~training).sum() >= _FEWEST_POINTS else ValidatedEffects(named, [], [])
+    return _sorted_by_gain(named, gains) if (~training).sum() >= _FEWEST_POINTS else ValidatedEffects(named, [], [])
 
 
 def _sorted_by_gain(
-    named: list[NamedEffect], gains: Callable[[Sequence[NamedEffect], Sequence[NamedEffect]], FloatArray], beside: bool
+    named: list[NamedEffect], gains: Callable[[Sequence[NamedEffect], Sequence[NamedEffect]], FloatArray]
 ) -> ValidatedEffects:
-    """Sort effects by their gains.
-
-    gains: function that returns the gain in each wall block of effects among others. beside: whether others were found beside
-    them, even if these failed.
-    """
+    """Sort effects by their gains. gains: function that returns the gain in each wall block of effects among others."""
     scorable = [item for item in named if item.effect.scored()]
     found = {id(item): gains([item], named) for item in scorable}
     total = {number: float(each.sum()) for number, each in found.items()}
@@ -126,7 +121,7 @@ def _sorted_by_gain(
     for group in _groups(strongest_first):
         if gains(group, named).sum() <= 0:
             out = min(group, key=lambda item: (item.kind != "empirical", total[id(item)]))
-            left = _sorted_by_gain([each for each in named if each is not out], gains, beside)
+            left = _sorted_by_gain([each for each in named if each is not out], gains)
             return ValidatedEffects(left.named, [out, *left.failed], left.weak)
     failed = [item for item in scorable if total[id(item)] <= item.effect.held_out_gain]
     kept = [item for item in named if item not in failed]
@@ -134,7 +129,7 @@ def _sorted_by_gain(
     gains_in_blocks = [found.get(id(item)) for item in kept]
     of_form = [item for item in measured if item.kind == "physical" and item.effect.shows_in in (ShowsIn.MEAN, ShowsIn.EDGES)]
     most = max((item.gain for item in of_form), default=0.0)
-    weak = [each for each, own in zip(measured, gains_in_blocks, strict=True) if beside and _is_weak(each, own, most)]
+    weak = [each for each, own in zip(measured, gains_in_blocks, strict=True) if len(kept) > 1 and _is_weak(each, own, most)]
     return ValidatedEffects([item for item in measured if item not in weak], failed, weak)
 
 
