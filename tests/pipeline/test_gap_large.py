@@ -375,26 +375,6 @@ def test_an_effect_from_which_few_blocks_gain_is_only_mentioned_beside_others(tm
     assert 0 < both.weak[0].gain < 2
 
 
-def test_an_effect_that_gains_little_is_only_mentioned_if_another_one_failed(tmp_path: Path) -> None:
-    """The ranges grow with the incidence angle, a thousand times as much as the effect says, which gains little so."""
-    write_scan(tmp_path, 8, ranges=lambda scan: scan.R + 0.01 * (1 / scan.cos_i - 1), step_rad=0.007)
-    there, residuals, _ = align(read_measurement(tmp_path))
-    blocks = WallCells.over(residuals.wall_xy).blocks
-    wrong, slight = (
-        NamedEffect(f"tls.{name}", "physical", {"name": name, key: value}, {}, (), 0.001, 10.0)
-        for name, key, value in (("range_scale", "scale_ppm", 900.0), ("range_incidence_bias", "coefficient_m", 1e-5))
-    )
-    alone, beside = (
-        validate_effects(there, residuals, found, ~blocks.for_validation(residuals.wall_xy), 0.0004, blocks)
-        for found in ([slight], [wrong, slight])
-    )
-    assert [item.name for item in alone.named] == ["tls.range_incidence_bias"]
-    assert 0 < alone.named[0].gain < 6
-    assert beside.failed == [wrong]
-    assert [item.name for item in beside.weak] == ["tls.range_incidence_bias"]
-    assert not beside.named
-
-
 @pytest.mark.parametrize(("amplitude_m", "named"), [(0.0004, False), (0.004, True)])
 def test_a_curve_beside_an_effect_that_gains_a_hundred_times_as_much_is_only_mentioned(
     tmp_path: Path, amplitude_m: float, named: bool

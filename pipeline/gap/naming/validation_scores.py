@@ -41,9 +41,9 @@ class ValidatedEffects:
     ----------
     named : effects that improve the predictions; the gain of each is its log-likelihood ratio on these parts.
     failed : effects that do not improve them.
-    weak : effects that improve them, but too little to be named if several were found, even if the others failed: by no more
-        than `variance.least_gain`, in too few wall blocks (`verdict.block_p`), with a size within its uncertainty of zero, or,
-        for an empirical term, by less than the share `mean.class_share` of what the strongest effect gains.
+    weak : effects that improve them, but too little to be named beside others: by no more than `variance.least_gain`, in too few
+        wall blocks (`verdict.block_p`), with a size within its uncertainty of zero, or, for an empirical term, by less than the
+        share `mean.class_share` of what the strongest effect gains.
     """
 
     named: list[NamedEffect]
