@@ -275,7 +275,10 @@ def test_what_a_low_pass_does_follows_the_rays_that_another_error_moves(smoothed
 
 
 def test_a_pairs_rays_are_not_traced_again_where_shift_and_turn_cancel(smoothed_disparities: StereoMeasurement) -> None:
-    """The move that changes disparities least is a shift and a turn; its size on the wall alone would call for new rays."""
+    """Of all moves of a pair, one shift and rotation together changes the disparities least.
+
+    It moves the rays on the wall so far that they would be traced again if only that counted.
+    """
     found = stereo_residuals(smoothed_disparities)
     relative = found.pose_jacobian / found.sigma[:, None]
     least = np.linalg.svd(relative, full_matrices=False)[2][-1]
@@ -309,7 +312,7 @@ def test_smoothing_must_also_show_beside_the_effect_that_makes_residuals_smalles
 def test_a_selection_is_repeated_until_it_selects_the_same_again(
     monkeypatch: pytest.MonkeyPatch, selections: list[str], kept: int, complete: bool
 ) -> None:
-    """Only then has it searched for all effects that it may lack. Each letter is the name of an effect."""
+    """A selection counts as complete only if it equals the one before. Each letter stands for an effect."""
 
     def selected(names: str) -> Any:
         return SimpleNamespace(estimates=[SimpleNamespace(candidate=SimpleNamespace(name=name)) for name in names])
@@ -320,3 +323,21 @@ def test_a_selection_is_repeated_until_it_selects_the_same_again(
     monkeypatch.setattr(nonlinear_refit, "_selected_at_fit", lambda *_: next(left))
     assert nonlinear_refit._relinearised(given, outcomes[0]) == (outcomes[kept], complete)
     assert next(left, None) is None
+
+
+@pytest.mark.parametrize(("most_points", "limit"), [(10**6, 1), (10, None)])
+def test_a_small_measurement_gets_one_thread_of_the_ray_tracer(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, most_points: int, limit: int | None
+) -> None:
+    write_scan(tmp_path, 10, step_rad=0.02)
+    asked: list[int | None] = []
+
+    def limited(most: int | None) -> Any:
+        asked.append(most)
+        raise InterruptedError
+
+    monkeypatch.setattr(workflow, "_FEW_POINTS", most_points)
+    monkeypatch.setattr(workflow, "limited_threads", limited)
+    with pytest.raises(InterruptedError):
+        workflow.diagnose(read_measurement(tmp_path))
+    assert asked == [limit]

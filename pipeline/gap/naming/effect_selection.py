@@ -164,7 +164,10 @@ class SelectionStart:
 
     @classmethod
     def of(cls, given: SelectionInput) -> SelectionStart:
-        """Find shifted tiles, rounding, locking and noise, and set up the linearised search for all other effects."""
+        """Set up the linearised search for effects, after those that are found by tests of their own.
+
+        These are shifted tiles of a stereo matcher, rounded ranges, pixel locking and noise terms.
+        """
         tiles = _shifted_tiles(given)
         given = given if tiles is None else _beside_tiles(given, tiles)
         apart = _FoundApart.of(given)

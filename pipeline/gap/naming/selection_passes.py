@@ -41,7 +41,9 @@ from sensors.effects.smoothing import Smoothing
 _MOST_POINTS = 60_000
 """Most points that a selection uses; more add little information to about 800 cells."""
 _MOST_CELLS = 400_000
-"""Largest pixel raster, in cells, on which edge effects are computed anew when another error is tried. It takes 0.4 s then."""
+"""Largest pixel raster, in cells, on which edge effects are computed anew for each trial of another error. On a raster of this
+size one computation takes 0.4 s.
+"""
 
 
 @dataclass(frozen=True)

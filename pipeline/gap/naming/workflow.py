@@ -161,8 +161,8 @@ def diagnose(
     GapDiagnosis : verdict, effects, scores and everything else that the report shows.
     """
     clock, random = _Clock(progress), KeyedRandom(seed, ("gap",))
-    # one BLAS thread: results do not depend on the number of threads, and no threads wait for each other
     few = len(measurement.cloud.points) <= _FEW_POINTS
+    # one BLAS thread: results do not depend on the number of threads, and no threads wait for each other
     with use_thresholds(thresholds), threadpool_limits(1, "blas"), limited_threads(1 if few else None):
         part, rows = subsample_measurement(prepared(measurement), random.child("thinned"))
         found = _diagnose(part, clock, random)
