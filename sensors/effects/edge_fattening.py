@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from functools import cached_property
 from typing import Literal
 
 import cv2
@@ -51,48 +53,58 @@ class EdgeFattening(RasterEffect):
         disparity: (rows, columns) of the depth map, px, NaN without a match. cell_px: px of the full-resolution frame for each
         cell. jump_px: smallest difference of neighbours that is a depth step, px.
         """
-        radius = int(self.radius_px / cell_px + 1e-9)
-        if self.window == "rim":
-            return fattened(disparity, radius, max(self.step_px, jump_px))
-        return largest_in_window(disparity, radius, self.step_px, square=self.window == "square")
+        return FatteningTrials(disparity).fattened(self, cell_px, jump_px)
 
 
-def fattened(disparity: FloatArray, radius: int, step_px: float) -> FloatArray:
-    """Let the near side of each depth step grow over the far side, as in a matcher's depth map, and return the new disparities.
+class FatteningTrials:
+    """Edge fattening of one depth map, of which many radii, steps and windows are tried: what trials share is computed once."""
 
-    Parameters
-    ----------
-    disparity : (rows, columns) array
-        Disparities, px, NaN where unmatched.
-    radius : int
-        How far the foreground grows, cells of the depth map.
-    step_px : float
-        Neighbours that differ by more than this are a depth step, px. An unmatched strip counts as background.
-    """
-    background = fill_gaps(disparity, np.inf)
-    lowest = cv2.erode(np.where(np.isnan(background), np.inf, background), _CROSS)
-    rim = np.where(disparity - lowest > step_px, disparity, -np.inf)
-    grown = cv2.dilate(rim, _disc(radius))
-    return np.where(grown - background > step_px, grown, disparity)
+    def __init__(self, disparity: FloatArray, look_up: Callable[[FloatArray], FloatArray] = np.asarray) -> None:
+        """Prepare the trials.
 
+        Parameters
+        ----------
+        disparity : (rows, columns) array
+            Disparities of the depth map, px, NaN where unmatched.
+        look_up : callable
+            Reads the cells of interest from an array with this shape; by default all cells.
+        """
+        self._disparity, self._look_up = disparity, look_up
+        self._here = look_up(disparity)
+        self._largest: dict[tuple[str, int], FloatArray] = {}
 
-def largest_in_window(disparity: FloatArray, radius: int, step_px: float, *, square: bool) -> FloatArray:
-    """Give each cell the largest disparity in a window about it, as in a matcher's depth map, if that is clearly larger.
+    def fattened(self, effect: EdgeFattening, cell_px: float, jump_px: float) -> FloatArray:
+        """Return the disparities of the cells of interest after an edge fattening, px, as `EdgeFattening.filtered` gives them.
 
-    Parameters
-    ----------
-    disparity : (rows, columns) array
-        Disparities, px, NaN where unmatched; such cells stay unmatched.
-    radius : int
-        Radius of a disc, or half-width of a square, cells of the depth map.
-    step_px : float
-        Cells of which the largest disparity in the window exceeds their own by no more than this do not change, px.
-    square : bool
-        Whether the window is a square.
-    """
-    window = np.ones((2 * radius + 1, 2 * radius + 1), dtype=np.uint8) if square else _disc(radius)
-    largest = cv2.dilate(np.where(np.isnan(disparity), -np.inf, disparity), window)
-    return np.where(largest - disparity > step_px, largest, disparity)
+        effect: the edge fattening to try. cell_px, jump_px: as for `EdgeFattening.filtered`.
+        """
+        radius = int(effect.radius_px / cell_px + 1e-9)
+        if effect.window == "rim":
+            return self._with_rims(radius, max(effect.step_px, jump_px))
+        largest = self._largest_in_window(effect.window, radius)
+        return np.where(largest - self._here > effect.step_px, largest, self._here)
+
+    def _with_rims(self, radius: int, step_px: float) -> FloatArray:
+        """Disparities, where the near side of each depth step grows over the far side. An unmatched strip is background."""
+        height, background = self._depth_steps
+        rim = np.where(height > step_px, self._disparity, -np.inf)
+        grown = self._look_up(cv2.dilate(rim, _disc(radius)))
+        return np.where(grown - background > step_px, grown, self._here)
+
+    @cached_property
+    def _depth_steps(self) -> tuple[FloatArray, FloatArray]:
+        """Height of each cell above its lowest neighbour, px; and disparity of the background in the cells of interest, px."""
+        background = fill_gaps(self._disparity, np.inf)
+        lowest = cv2.erode(np.where(np.isnan(background), np.inf, background), _CROSS)
+        return self._disparity - lowest, self._look_up(background)
+
+    def _largest_in_window(self, window: str, radius: int) -> FloatArray:
+        """Largest disparity in a window about each cell of interest, px; cached. radius: of a disc or half a square, cells."""
+        if (window, radius) not in self._largest:
+            kernel = np.ones((2 * radius + 1, 2 * radius + 1), dtype=np.uint8) if window == "square" else _disc(radius)
+            matched = np.where(np.isnan(self._disparity), -np.inf, self._disparity)
+            self._largest[window, radius] = self._look_up(cv2.dilate(matched, kernel))
+        return self._largest[window, radius]
 
 
 def _disc(radius: int) -> NDArray[np.uint8]:

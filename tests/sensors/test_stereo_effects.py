@@ -27,7 +27,7 @@ from sensors.cameras.camera import Camera, CameraPair
 from sensors.cameras.rectification import rectify
 from sensors.effects import FURTHER_EFFECTS, STEREO_EFFECTS
 from sensors.effects.base import Effect
-from sensors.effects.edge_fattening import EdgeFattening, fattened
+from sensors.effects.edge_fattening import EdgeFattening, FatteningTrials
 from sensors.effects.smoothing import smoothed
 from sensors.effects.texture_noise import LARGEST_SIGMA_PX, WINDOW, TextureNoise, texture
 from sensors.models.placement import RigConfig, Target
@@ -366,6 +366,11 @@ def texture_slowly(image: FloatArray, reduction: int) -> FloatArray:
     return np.array([[padded[y : y + WINDOW, x : x + WINDOW].sum() for x in range(columns)] for y in range(rows)])
 
 
+def fattened(relief: FloatArray, radius: int, step_px: float) -> FloatArray:
+    """Rims of disparities (rows, columns), px, grown by some cells."""
+    return EdgeFattening(radius_px=radius, step_px=step_px).filtered(relief, 1.0, step_px)
+
+
 @pytest.mark.parametrize("seed", [1, 2])
 def test_fast_rasters_agree_with_their_slow_twins(seed: int) -> None:
     relief = random_relief(seed)
@@ -374,6 +379,15 @@ def test_fast_rasters_agree_with_their_slow_twins(seed: int) -> None:
     for radius in (0, 1, 3):
         np.testing.assert_array_equal(fattened(relief, radius, 2.0), fattened_slowly(relief, radius, 2.0))
     np.testing.assert_allclose(texture(relief, 4), texture_slowly(relief, 4), rtol=1e-12, atol=1e-15)
+
+
+def test_trials_of_fattening_at_some_cells_are_those_of_the_whole_map() -> None:
+    relief, rows = random_relief(3), (np.array([0, 4, 4, 7]), np.array([2, 0, 5, 1]))
+    trials = FatteningTrials(relief, lambda raster: raster[rows])
+    for window, radius, step_px in itertools.product(("rim", "disc", "square"), (1, 3, 1), (0.5, 2.0)):
+        effect = EdgeFattening.model_validate({"radius_px": radius, "step_px": step_px, "window": window})
+        whole = effect.filtered(relief, 1.0, 1.0)
+        np.testing.assert_array_equal(trials.fattened(effect, 1.0, 1.0), whole[rows])
 
 
 def test_niche_rims_shrink_by_the_radius_and_slopes_stay() -> None:

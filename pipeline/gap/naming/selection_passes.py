@@ -271,9 +271,11 @@ class PassInputs:
 
     def _edge_effects_beside(self, named: list[NamedEffect], known: list[NamedEffect]) -> list[EdgeEffect]:
         """Find edge effects beside other effects. known: edge effects that are in the model while the pose is estimated."""
-        posed = aligned_with(self.measurement, [*named, *known], self.plain.index[~self._held_out]).measurement
-        seen = posed.changed(model=with_effects(self.measurement.model, [item.entry for item in named]))
-        return _find_edge_effects(seen, compute_residuals(seen), self.held_out_points)
+        seen, found, _ = aligned_with(self.measurement, [*named, *known], self.plain.index[~self._held_out])
+        if known:
+            seen = seen.changed(model=with_effects(self.measurement.model, [item.entry for item in named]))
+            found = compute_residuals(seen)
+        return _find_edge_effects(seen, found, self.held_out_points)
 
     def with_these(self, edge_effects: list[EdgeEffect]) -> PassInput:
         """Return the input of a search for sensor errors, with effects at depth steps in the model and the pose fitted again."""

@@ -247,7 +247,7 @@ def _search(data: _EdgeData) -> list[EdgeEffect]:
 def align_beside_fattening(
     measurement: StereoMeasurement, initial: StereoResiduals, aligned: AlignedMeasurement, trusted: NDArray[np.int64]
 ) -> AlignedMeasurement:
-    """Estimate the pose again with edge fattening in the model, where that fits better at the surveyed pose.
+    """Estimate the pose again with edge fattening in the model, where it is significant and fits better at the surveyed pose.
 
     A window that takes the nearest rock changes most disparities of a steep wall. Without it in the model, the pose that fits
     best can be off by decimetres, and nothing is predicted rightly there.
@@ -270,7 +270,8 @@ def align_beside_fattening(
     if given is None or plain is None:
         return aligned
     best, least = most_likely_fattening(given.for_trials()), thresholds().edges.least_gain
-    if given.registered_density([best]).sum() < plain.registered_density([]).sum() + least:
+    likelier = given.registered_density([best]).sum() >= plain.registered_density([]).sum() + least
+    if not likelier or _accepted_fattening(given, best) is None:
         return aligned
     fattened = measurement.changed(model=measurement.model.model_copy(update={"effects": (*measurement.model.effects, best)}))
     pose = align(fattened, trusted, compute_residuals(fattened)).pose
@@ -342,7 +343,11 @@ def _find_fattening(data: _EdgeData) -> EdgeEffect | None:
 
     Radii are whole cells, because the radii in between do the same.
     """
-    best = most_likely_fattening(data.for_trials())
+    return _accepted_fattening(data, most_likely_fattening(data.for_trials()))
+
+
+def _accepted_fattening(data: _EdgeData, best: EdgeFattening) -> EdgeEffect | None:
+    """The most likely edge fattening with its uncertainty, if it is significant and the wall blocks agree; else None."""
 
     def gains(cells: float) -> FloatArray:
         trial = best.model_copy(update={"radius_px": (cells + _ROUNDED_CELLS[0]) * data.raster.step})

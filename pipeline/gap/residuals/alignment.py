@@ -22,6 +22,7 @@ from pipeline.gap.residuals.tls_residuals import tls_residuals
 from pipeline.gap.thresholds import thresholds
 from scene.common.threads import map_in_threads
 from scene.geometry.mesh import FloatArray
+from sensors.effects.raster_effect import RasterEffect
 
 _ROUNDS = 6
 """Most rounds of outlier rejection."""
@@ -39,6 +40,12 @@ points: a shift and a rotation of a distant pair can nearly cancel, so that thei
 """
 _RETRACE_FROM_SIGMAS, _MOST_MOVES_OF_SURFACES = 0.1, 12
 """The same for a surface without cameras, where only this counts: its nearest places on the reference change as it moves."""
+
+
+_MANY, _PART = 250_000, 60_000
+"""Points of a measurement from which on a pose is first estimated from a part of them, and at least how many of the trusted ones:
+their pose differs from that of all by a small part of the noise, so that the residuals of all points are computed only once.
+"""
 
 
 def fit_pose_robustly(residuals: Residuals) -> tuple[FloatArray, FloatArray, float]:
@@ -216,8 +223,12 @@ def align(
     -------
     The measurement, its residuals at the fitted pose, and the pose. A move is undone if no ray would hit the wall after it.
     """
-    found = compute_residuals(measurement) if found is None else found
-    total = np.zeros(found.pose_jacobian.shape[1])
+    start: FloatArray | float = 0.0
+    if found is None:
+        if (pose := _pose_from_part(measurement, trusted)) is not None and pose.any():
+            measurement, start = measurement.moved(pose), pose
+        found = compute_residuals(measurement)
+    total = np.zeros(found.pose_jacobian.shape[1]) + start
     most = _MOST_MOVES_OF_SURFACES if isinstance(measurement, SurfaceMeasurement) else _MOST_MOVES
     for _ in range(most if len(found) else 0):
         usable = found.usable if trusted is None else found.usable & np.isin(found.index, trusted)
@@ -230,6 +241,20 @@ def align(
             break
         measurement, total, found = aligned, total + pose, new_residuals
     return AlignedMeasurement(measurement, found, total)
+
+
+def _pose_from_part(measurement: Measurement, trusted: NDArray[np.int64] | None) -> FloatArray | None:
+    """Estimate the pose, as `align` does, from evenly spaced ones of many points; None if all points are needed.
+
+    They are needed if there are few, without cameras (the points then define the pose's parameters), and for effects by which
+    neighbouring pixels influence each other. trusted: see `align`.
+    """
+    count = len(measurement.cloud.points)
+    by_neighbours = any(isinstance(effect, RasterEffect) for effect in measurement.model.effects)
+    if count < _MANY or by_neighbours or isinstance(measurement, SurfaceMeasurement):
+        return None
+    rows = np.arange(count) if trusted is None else trusted
+    return align(measurement.part(rows[:: max(len(rows) // _PART, 1)])).pose
 
 
 def _moves_far(pose: FloatArray, residuals: Residuals) -> bool:

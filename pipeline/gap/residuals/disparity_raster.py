@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -17,6 +18,7 @@ from scene.common.threads import map_in_threads
 from scene.geometry.mesh import FloatArray
 from sensors.cameras.camera import Camera
 from sensors.effects.base import Effect
+from sensors.effects.edge_fattening import EdgeFattening, FatteningTrials
 from sensors.effects.raster_effect import RasterEffect
 from sensors.effects.smoothing import LowPass, Smoothing
 
@@ -156,8 +158,7 @@ class DisparityRaster:
         disparities, px; NaN without a match.
         """
         found = self.disparity
-        filters = (effect for effect in effects if isinstance(effect, RasterEffect))
-        for effect in sorted(filters, key=lambda effect: (effect.stage, effect.order)):
+        for effect in _filters(effects):
             found = effect.filtered(found, self.step, self.depth_step_px)
         return found
 
@@ -168,7 +169,23 @@ class DisparityRaster:
         stands in for the raster's value in cells that are NaN. The result is 0 where the effects give no match.
         """
         plain = self.at_points(self.disparity)
-        return np.nan_to_num(self.at_points(self.apply(effects)) - np.where(np.isnan(plain), disparity, plain))
+        match _filters(effects):
+            case [EdgeFattening() as fattening]:  # the same, without computing all cells
+                found = self._fattening_trials.fattened(fattening, self.step, self.depth_step_px)
+            case filters:
+                found = self.at_points(self.apply(filters))
+        return np.nan_to_num(found - np.where(np.isnan(plain), disparity, plain))
+
+    @cached_property
+    def _fattening_trials(self) -> FatteningTrials:
+        """Edge fattening of the reference at the points, as the only effect."""
+        return FatteningTrials(self.disparity, self.at_points)
+
+
+def _filters(effects: Iterable[Effect]) -> list[RasterEffect]:
+    """The effects in which neighbouring pixels play a part, in the order in which a matcher applies them."""
+    chosen = (effect for effect in effects if isinstance(effect, RasterEffect))
+    return sorted(chosen, key=lambda effect: (effect.stage, effect.order))
 
 
 def apply_smoothing(effects: Iterable[Effect], geometry: PixelGeometry, columns: FloatArray) -> FloatArray:

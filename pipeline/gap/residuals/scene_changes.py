@@ -37,6 +37,7 @@ from pipeline.gap.residuals.residuals import BoolArray, Residuals
 from pipeline.gap.residuals.sensor_view import NEIGHBOURS, SensorView
 from pipeline.gap.residuals.standardized import group_medians, nmad_along_covariates, standardize
 from pipeline.gap.thresholds import thresholds
+from scene.common.threads import map_in_threads
 from scene.geometry.frame import WallFrame
 from scene.geometry.mesh import FloatArray
 
@@ -189,8 +190,12 @@ def _components(z: FloatArray, faint: FloatArray, view: SensorView, eligible: Bo
     pairs = pairs[:, side[pairs[0]] * side[pairs[1]] > 0]
     least = max(thresholds().points.registration_outlier_sigmas, _correlated_sigmas(z, view, eligible))
     core = _faint_cores(faint, exceeds, pairs, eligible)
-    for sign, level, ratio in product((1.0, -1.0), _LEVELS, _RATIOS):
-        core |= _significant(sign * z, level, ratio, pairs, eligible, least)
+
+    def search(which: tuple[float, float, float]) -> BoolArray:
+        sign, level, ratio = which
+        return _significant(sign * z, level, ratio, pairs, eligible, least)
+
+    core = np.any([core, *map_in_threads(search, product((1.0, -1.0), _LEVELS, _RATIOS))], axis=0)
     whole = _extended(core, size, pairs, eligible)
     label = _compact(_connected(whole, pairs), int(eligible.sum()))
     inside = pairs[:, whole[pairs].all(axis=0)]

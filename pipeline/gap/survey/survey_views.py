@@ -34,6 +34,8 @@ from sensors.stereo.stereo_pair import REDUCTION, Quality, StereoPair
 
 _MOST_PULSES = 30_000
 """Most pulses or pixels of a view's subsample."""
+_MOST_TRACED = 100_000
+"""Points of a measured pair from which a view is made: one in k, where at least twice as many lie in it."""
 _FEWEST_POINTS = 300
 """Fewest points on smooth parts of the wall."""
 _ALBEDO_SPREAD = 0.3
@@ -216,8 +218,10 @@ def measured_survey(measurement: Measurement, most: int = _MOST_PULSES) -> Surve
     """
     centre = measurement.reference.bounds.mean(axis=0)
     if isinstance(measurement, StereoMeasurement):
-        pair = SurveyView.subsampled(stereo_residuals(measurement), most, 0, measurement)
-        return Survey((pair,), centre, _pair_observer("medium"))
+        every = max(len(measurement.cloud.points) // _MOST_TRACED, 1)
+        some = measurement.part(np.arange(0, len(measurement.cloud.points), every))
+        pair = SurveyView.subsampled(stereo_residuals(some), most, 0, measurement)
+        return Survey((replace(pair, point_count=every * pair.point_count),), centre, _pair_observer("medium"))
     if isinstance(measurement, SurfaceMeasurement):
         raise InputError(
             "the measurement has no cameras, so no effect can be analysed",
