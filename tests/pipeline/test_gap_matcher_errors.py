@@ -18,6 +18,7 @@ from pipeline.gap.mean.search import MeanSearch
 from pipeline.gap.naming.candidate_families import catalogue_families
 from pipeline.gap.naming.named_effects import within_bounds
 from pipeline.gap.naming.selection_passes import PassInputs
+from pipeline.gap.noise_and_edges import disparity_edges
 from pipeline.gap.noise_and_edges.disparity_edges import align_beside_fattening, find_disparity_edge_effects
 from pipeline.gap.residuals.alignment import align, compute_residuals, fit_pose_robustly
 from pipeline.gap.residuals.disparity_raster import raster_cell_px
@@ -59,7 +60,11 @@ def test_a_window_that_takes_the_nearest_rock_is_found_beside_its_pose(
     there = measured(tmp_path, monkeypatch, seed, nearest)
     initial = compute_residuals(there)
     assert isinstance(initial, StereoResiduals)
-    found = align_beside_fattening(there, initial, align(there, None, initial), initial.index)
+    aligned = align(there, None, initial)
+    with monkeypatch.context() as patched:
+        patched.setattr(disparity_edges, "_SPOILT", 100.0)  # more than the wrong pose costs anywhere
+        assert align_beside_fattening(there, initial, aligned, initial.index) is aligned
+    found = align_beside_fattening(there, initial, aligned, initial.index)
     assert isinstance(found.measurement, StereoMeasurement)
     assert isinstance(found.residuals, StereoResiduals)
     nothing = np.zeros(len(found.residuals), dtype=bool)

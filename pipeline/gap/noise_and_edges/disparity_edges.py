@@ -50,6 +50,8 @@ _FILLED_SHARE, _STRAY_SHARE = 0.9, 0.02
 """Probability that a cell of a strip holds a point where strips of its width are filled, and where they are not."""
 _EDGE_MARGIN_CELLS, _REGISTRATIONS = 2, 3
 """Cells beyond the radius of edge fattening that are unpredictable too, and registrations beside a low-pass."""
+_SPOILT = 0.01
+"""Log-likelihood per point by which a pose must be better for it to be tried: a pose that is off spoils predictions everywhere."""
 _STEP_MARGIN = 1.1
 """Ratio of steps between which it is uncertain whether a matcher counts a difference as a step."""
 _COPY_TOLERANCE = 0.02
@@ -247,7 +249,7 @@ def _search(data: _EdgeData) -> list[EdgeEffect]:
 def align_beside_fattening(
     measurement: StereoMeasurement, initial: StereoResiduals, aligned: AlignedMeasurement, trusted: NDArray[np.int64]
 ) -> AlignedMeasurement:
-    """Estimate the pose again with edge fattening in the model, where it is significant and fits better at the surveyed pose.
+    """Estimate the pose again with edge fattening in the model, where that fits better at the surveyed pose.
 
     A window that takes the nearest rock changes most disparities of a steep wall. Without it in the model, the pose that fits
     best can be off by decimetres, and nothing is predicted rightly there.
@@ -270,8 +272,9 @@ def align_beside_fattening(
     if given is None or plain is None:
         return aligned
     best, least = most_likely_fattening(given.for_trials()), thresholds().edges.least_gain
-    likelier = given.registered_density([best]).sum() >= plain.registered_density([]).sum() + least
-    if not likelier or _accepted_fattening(given, best) is None:
+    _, here, there_too = np.intersect1d(given.residuals.index, plain.residuals.index, assume_unique=True, return_indices=True)
+    gains = given.registered_density([best])[here] - plain.registered_density([])[there_too]
+    if gains.sum() < least + _SPOILT * len(gains):
         return aligned
     fattened = measurement.changed(model=measurement.model.model_copy(update={"effects": (*measurement.model.effects, best)}))
     pose = align(fattened, trusted, compute_residuals(fattened)).pose
@@ -343,11 +346,7 @@ def _find_fattening(data: _EdgeData) -> EdgeEffect | None:
 
     Radii are whole cells, because the radii in between do the same.
     """
-    return _accepted_fattening(data, most_likely_fattening(data.for_trials()))
-
-
-def _accepted_fattening(data: _EdgeData, best: EdgeFattening) -> EdgeEffect | None:
-    """The most likely edge fattening with its uncertainty, if it is significant and the wall blocks agree; else None."""
+    best = most_likely_fattening(data.for_trials())
 
     def gains(cells: float) -> FloatArray:
         trial = best.model_copy(update={"radius_px": (cells + _ROUNDED_CELLS[0]) * data.raster.step})
