@@ -170,7 +170,7 @@ class DisparityRaster:
         """
         plain = self.at_points(self.disparity)
         match _filters(effects):
-            case [EdgeFattening() as fattening]:  # the same, without computing all cells
+            case [EdgeFattening() as fattening]:  # gives the same, and many are tried
                 found = self._fattening_trials.fattened(fattening, self.step, self.depth_step_px)
             case filters:
                 found = self.at_points(self.apply(filters))
