@@ -2,11 +2,12 @@
 
 Targets: a million points of each sensor in 60 s on two cores and 4 GB, and 20 million ranges in 6 GB.
 
-    python benchmarks/gap.py [tls] [stereo] [--points 1000000 ...] [--write]
+    python benchmarks/gap.py [tls] [stereo] [--points 1000000 ...] [--avx2] [--write]
 
 The measurements are made by the closed-form generator, in its own process. Each is read and diagnosed with an empty kernel cache,
 as for a new user, and again with the kernels of that. Further target: 60 bare casts of the same rays, or 60 s. `--write` puts the
-table into docs/validation/gap.md.
+table into docs/validation/gap.md. `--avx2` measures as on a processor without AVX-512: the ray tracer, NumPy and its linear
+algebra do not use it then.
 """
 
 from __future__ import annotations
@@ -22,7 +23,7 @@ from pathlib import Path
 from typing import Any
 
 from documents import write_between
-from measure import bare_cast, empty_kernel_cache, medians, peak_memory_gb
+from measure import bare_cast, empty_kernel_cache, medians, narrow_vectors, peak_memory_gb
 
 from pipeline.formats.measurements.measurement import Measurement, TlsMeasurement, read_measurement
 from pipeline.gap.naming.workflow import diagnose
@@ -31,6 +32,7 @@ from sensors.numerics.device import vector
 
 CASES = {"tls": ("vertical_index", (1, 1)), "stereo": ("focal_length", (1, 6))}
 """The effect and the seed, by sensor; every second pixel of the pair that this seed makes is a million."""
+_WITHOUT_AVX512 = {"OPENBLAS_CORETYPE": "Haswell", "NPY_DISABLE_CPU_FEATURES": "X86_V4 AVX512_ICL AVX512_SPR"}
 _ROOT = Path(__file__).parents[1]
 _TABLE = ("<!-- times -->", "<!-- end of times -->")
 
@@ -75,14 +77,14 @@ def made(sensor: str, points: int, folder: Path) -> Path:
     return case
 
 
-def timed(case: Path) -> list[dict[str, Any]]:
-    """Time the diagnosis with an empty kernel cache and with a filled one, each in a process of its own."""
+def timed(case: Path, avx2: bool) -> list[dict[str, Any]]:
+    """Time the diagnosis with an empty kernel cache and with a filled one, in processes of their own. avx2: without AVX-512."""
     rows, answer = [], case.with_name("times.json")
     with empty_kernel_cache() as environment:
         for cache in ("an empty", "a filled"):
             print(f"with {cache} kernel cache", flush=True)
-            command = [sys.executable, __file__, "--measurement", str(case), "--to", str(answer)]
-            subprocess.run(command, check=True, env=environment)
+            command = [sys.executable, __file__, "--measurement", str(case), "--to", str(answer), *(["--avx2"] if avx2 else [])]
+            subprocess.run(command, check=True, env=environment | (_WITHOUT_AVX512 if avx2 else {}))
             rows.append(json.loads(answer.read_text()))
     return rows
 
@@ -107,11 +109,13 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("sensors", nargs="*", default=list(CASES), help="tls, stereo")
     parser.add_argument("--points", type=int, nargs="+", default=[1_000_000])
+    parser.add_argument("--avx2", action="store_true", help="without AVX-512")
     parser.add_argument("--write", action="store_true", help="put the table into docs/validation/gap.md")
     parser.add_argument("--measurement", type=Path, help="diagnose this folder instead")
     parser.add_argument("--to", type=Path, help="file for its times")
     arguments = parser.parse_args()
     if arguments.measurement:
+        narrow_vectors()  # if --avx2
         times = report(arguments.measurement)
         if arguments.to:
             arguments.to.write_text(json.dumps(times))
@@ -121,7 +125,7 @@ def main() -> None:
         for points in arguments.points:
             with tempfile.TemporaryDirectory() as folder:
                 print(f"{sensor}, about {points:,} points", flush=True)
-                found.setdefault(sensor, []).append(timed(made(sensor, points, Path(folder))))
+                found.setdefault(sensor, []).append(timed(made(sensor, points, Path(folder)), arguments.avx2))
     print(table(found))
     if arguments.write:
         write_between(_ROOT / "docs/validation/gap.md", _TABLE, table(found))
