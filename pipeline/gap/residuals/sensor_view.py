@@ -131,7 +131,7 @@ class SensorView:
     def _trees(self) -> list[tuple[NDArray[np.int64], cKDTree]]:
         """For each epoch the rows of its points and a search tree of their scaled coordinates."""
         groups = [np.flatnonzero(self.epoch == number) for number in np.unique(self.epoch)]
-        return [(rows, cKDTree(self.scaled_coordinates[rows])) for rows in groups]
+        return [(rows, _search_tree(self.scaled_coordinates[rows])) for rows in groups]
 
     def neighbour_pairs(self, rows: NDArray[np.int64]) -> NDArray[np.int64]:
         """Pair points with their neighbours in the sensor's field of view, to find connected groups of points.
@@ -180,7 +180,7 @@ class SensorView:
         rows: row numbers of the chosen points. spacings: largest distance, in spacings of neighbouring points. Returns true (n,)
         for points of any epoch within this distance of a chosen one, and for these themselves.
         """
-        tree = cKDTree(self.scaled_coordinates[rows])
+        tree = _search_tree(self.scaled_coordinates[rows])
         return np.isfinite(tree.query(self.scaled_coordinates, distance_upper_bound=spacings, workers=-1)[0])
 
     def solid_angles(self, rows: NDArray[np.int64]) -> FloatArray:
@@ -224,10 +224,15 @@ def _side_by_side(plane: FloatArray, scan: NDArray[np.int64]) -> FloatArray:
     return found
 
 
+def _search_tree(plane: FloatArray) -> cKDTree:
+    """Search tree of positions (n, 2); they fill the field of view evenly, so that balancing it would only take time."""
+    return cKDTree(plane, balanced_tree=False, compact_nodes=False)
+
+
 def _axis_spacings(plane: FloatArray) -> FloatArray:
     """(2,) median distance to the nearest point along each axis, among neighbours that lie mostly along that axis."""
     some = plane[:: max(len(plane) // _SAMPLE, 1)]
-    rows = cKDTree(plane).query(some, min(_NEAR, len(plane)))[1]
+    rows = _search_tree(plane).query(some, min(_NEAR, len(plane)))[1]
     offset = np.abs(plane[rows[:, 1:]] - some[:, None])
     along = [np.where(offset[..., axis] >= offset[..., 1 - axis], offset[..., axis], np.inf).min(axis=1) for axis in (0, 1)]
     found = np.median(along, axis=1)
