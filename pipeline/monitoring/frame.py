@@ -9,6 +9,7 @@ from pipeline.measurement.scans import RawScan
 from pipeline.measurement.station import find_station
 from pipeline.monitoring.options import MonitorOptions
 from pipeline.monitoring.reading import EpochData
+from pipeline.monitoring.records import CAUTION
 from scene.common.errors import InputError
 from scene.geometry.bounds import bounding_box
 from scene.geometry.frame import WallFrame
@@ -66,6 +67,39 @@ def towards_sensor(data: EpochData, options: MonitorOptions, name: str) -> tuple
             remedy="give --position X,Y,Z: where the scanner stood, or any place before the wall, in the file's coordinates",
         ) from None
     return station.position, "where the scan lines meet"
+
+
+def doubt_of_side(data: EpochData, options: MonitorOptions, frame: WallFrame, name: str) -> list[str]:
+    """Return a caution if the position that the user gave lies behind the wall, as the file or its scan lines show.
+
+    All changes would have the wrong sign then: what fell would be listed as added.
+
+    Parameters
+    ----------
+    data : EpochData
+        Content of the reference's file.
+    options : MonitorOptions
+        Has the position, if one was given.
+    frame : WallFrame
+        The wall frame, whose z axis points to the side of that position.
+    name : str
+        Name of the file.
+    """
+    if options.position is None or data.mesh is not None:
+        return []
+    seen, how = data.position, "the file states"
+    if seen is None:
+        try:
+            seen, how = find_station(RawScan(name, PointCloud(data.in_order[:_SAMPLE]))).position, "the scan lines show"
+        except InputError:
+            return []
+    if frame.to_wall(seen[None])[0, 2] > 0:
+        return []
+    place = ", ".join(f"{value:.2f}" for value in seen)
+    return [
+        f"{CAUTION}--position lies behind the wall, as {how} that the scanner stood on its other side, at ({place}): if they are "
+        "right, missing rock is listed as added and the other way round. Give that place with --position"
+    ]
 
 
 def wall_frame(points: FloatArray, towards: FloatArray, direction: FloatArray | None) -> WallFrame:

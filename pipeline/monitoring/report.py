@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import shlex
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -84,8 +84,12 @@ def _name_of_crs(wkt: str) -> str:
 
 
 def headline(result: Result) -> list[str]:
-    """Return one sentence for each epoch: what fell, what was added, and the level of detection of a pixel."""
-    told = []
+    """Return one sentence for each epoch: what fell, what was added, and the level of detection of a pixel.
+
+    A caution on the reference comes first, if there is one.
+    """
+    doubts = _cautions(result.site.notes)
+    told = [f"Reference, {result.site.source.name}:{doubts}"] if doubts else []
     for epoch in result.epochs:
         when = f" ({epoch.source.time.text})" if epoch.source.time.when else ""
         parts = [_kind_in_words(epoch, kind) for kind in ("missing", "added")]
@@ -94,7 +98,7 @@ def headline(result: Result) -> list[str]:
         doubtful = f" Edges, vegetation or noise may explain {marked} of {len(epoch.regions)} events (marked)." if marked else ""
         told.append(
             f"Epoch {epoch.number}, {epoch.source.name}{when}: {found}. The level of detection of "
-            f"a single pixel is {1e3 * epoch.record.level_m:.1f} mm (95 %, median).{doubtful}{_cautions(epoch)}"
+            f"a single pixel is {1e3 * epoch.record.level_m:.1f} mm (95 %, median).{doubtful}{_cautions(epoch.record.notes)}"
         )
     return told
 
@@ -114,9 +118,9 @@ def next_step(result: Result) -> str:
     return f"Find out with `{scanner}`{place}, which diagnoses the stable rock, and fit the noise there with `{noise}`."
 
 
-def _cautions(epoch: Followed) -> str:
-    """Remarks without which the numbers of an epoch would mislead, as sentences."""
-    return "".join(f" {note[0].upper()}{note[1:]}." for note in epoch.record.notes if note.startswith(CAUTION))
+def _cautions(notes: Iterable[str]) -> str:
+    """Those remarks without which numbers would mislead, as sentences, each after a space."""
+    return "".join(f" {note[0].upper()}{note[1:]}." for note in notes if note.startswith(CAUTION))
 
 
 def law_in_words(law: PowerLaw) -> str:

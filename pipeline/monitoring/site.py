@@ -10,7 +10,7 @@ import numpy as np
 from pipeline.change.areas import check_some_inside
 from pipeline.monitoring.alignment import SAME
 from pipeline.monitoring.comparison import ReferenceHeights
-from pipeline.monitoring.frame import raster_of, towards_sensor, wall_frame
+from pipeline.monitoring.frame import doubt_of_side, raster_of, towards_sensor, wall_frame
 from pipeline.monitoring.gridding import HeightRaster
 from pipeline.monitoring.options import MonitorOptions
 from pipeline.monitoring.reading import EpochData, EpochSource, read_epoch
@@ -118,7 +118,7 @@ def prepared(source: EpochSource, options: MonitorOptions) -> ReferenceSite:
     parts = zip(frames, reference.rasters, strict=True)
     views = tuple(WallView(number, *each) for number, each in enumerate(parts, start=1))
     notes = [*data.notes, f"the wall was seen from its side of ({', '.join(f'{value:.2f}' for value in towards)}), {how}"]
-    notes += _notes(views)
+    notes += [*doubt_of_side(data, options, wall, source.name), *_notes(views)]
     return ReferenceSite(source, views, wall.to_wall(towards), reference, data.count, data.crs, tuple(notes))
 
 
