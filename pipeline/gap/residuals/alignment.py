@@ -225,7 +225,7 @@ def align(
     if found is None and (pose := _pose_from_part(measurement, trusted)) is not None:
         there = measurement.moved(pose)
         rest = align(there, trusted, compute_residuals(there))
-        return rest._replace(pose=pose + rest.pose)
+        return AlignedMeasurement(rest.measurement, rest.residuals, pose + rest.pose)
     found = compute_residuals(measurement) if found is None else found
     total = np.zeros(found.pose_jacobian.shape[1])
     most = _MOST_MOVES_OF_SURFACES if isinstance(measurement, SurfaceMeasurement) else _MOST_MOVES
