@@ -179,7 +179,8 @@ def select_and_refit(given: SearchInput, first: MeanSearch) -> SearchOutcome:
     best = _simpler(given, best, linear, ties=not alone)
     if best is None or best.complexity > (0, 1):
         relinearised, complete = _relinearised(given, linear)
-        best = _simpler(given, best, relinearised, ties=True, complete=complete)
+        if relinearised is not linear:
+            best = _simpler(given, best, relinearised, ties=True, complete=complete)
     return linear if best is None else best
 
 
@@ -196,7 +197,8 @@ def outline_effects(given: SearchInput, first: MeanSearch) -> list[Estimate]:
 def _relinearised(given: SearchInput, linear: SearchOutcome) -> tuple[SearchOutcome, bool]:
     """Repeat a selection with derivatives taken at the model that holds its effects, until it selects the same ones again.
 
-    This is the Gauss-Newton iteration, with the set of effects free as well as their sizes.
+    This is the Gauss-Newton iteration, with the set of effects free as well as their sizes. It ends with the linearised selection
+    where an empirical term is selected with the new derivatives too: then the misfit does not come from linearising.
 
     Returns
     -------
@@ -206,6 +208,8 @@ def _relinearised(given: SearchInput, linear: SearchOutcome) -> tuple[SearchOutc
     while (names := {each.candidate.name for each in found.estimates}) not in seen and len(seen) < _MOST_SELECTIONS:
         seen.append(names)
         found = _selected_at_fit(given, found) or found
+        if linear.complexity[0] and found.complexity[0] >= linear.complexity[0]:
+            return linear, False
     return found, found is not linear and names == seen[-1]
 
 

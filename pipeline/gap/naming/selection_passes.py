@@ -45,6 +45,9 @@ _MOST_CELLS = 400_000
 size one computation takes 0.4 s.
 """
 
+_NEGLIGIBLE = 0.1
+"""Change of an edge effect's parameter, in its standard deviations, for which a search is not repeated."""
+
 
 @dataclass(frozen=True)
 class PassInput:
@@ -299,13 +302,25 @@ def select_beside_edge_effects(inputs: PassInputs, random: KeyedRandom, excluded
     pass_input = inputs.with_these(inputs.edge_effects)
     start = pass_input.start(random, excluded)
     if outline := start.outline():
-        before = [each.effect for each in pass_input.edge_effects]
-        imitated = {Smoothing.tag()} - {each.name for each in before}  # a small error of the rays' directions looks like it
+        imitated = {Smoothing.tag()} - _names(pass_input.edge_effects)  # a small error of the rays' directions looks like it
         edge_effects = [each for each in inputs.edge_effects_given(outline) if each.name not in imitated]
-        if [each.effect for each in edge_effects] != before:
+        if not _much_the_same(pass_input.edge_effects, edge_effects):
             pass_input = inputs.with_these(edge_effects)
             start = pass_input.start(random, excluded)
     return SelectionPass(pass_input, *select_effects(start))
+
+
+def _much_the_same(before: list[EdgeEffect], after: list[EdgeEffect]) -> bool:
+    """Whether the same edge effects were found, with values that differ by a small part of their standard deviations."""
+
+    def settings(each: EdgeEffect) -> dict[str, Any]:
+        return each.effect.model_dump(exclude=set(each.std))
+
+    def near(one: EdgeEffect, other: EdgeEffect) -> bool:
+        change = {key: getattr(other.effect, key) - getattr(one.effect, key) for key in one.std}
+        return settings(one) == settings(other) and all(abs(change[key]) <= _NEGLIGIBLE * std for key, std in one.std.items())
+
+    return len(before) == len(after) and all(near(*pair) for pair in zip(before, after, strict=True))
 
 
 def subsample_rows(rows: NDArray[np.int64]) -> NDArray[np.int64]:
