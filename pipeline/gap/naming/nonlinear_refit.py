@@ -28,9 +28,10 @@ from pipeline.gap.residuals.residuals import BoolArray, Residuals
 from pipeline.gap.thresholds import equivalence_margin, thresholds
 from scene.geometry.mesh import FloatArray
 
-_MOST_CONVERGED, _MOST_ROUNDS, _CONVERGED_GAIN, _MOST_SELECTIONS = 3, 8, 1.0, 3
-"""Number of effects that are refitted to convergence, largest number of iterations, gain of log-likelihood that ends them, and
-most selections that are repeated with new derivatives."""
+_MOST_CONVERGED, _MOST_ROUNDS, _CONVERGED_GAIN = 3, 8, 1.0
+"""Number of effects that are refitted to convergence, largest number of iterations, and gain of log-likelihood that ends them."""
+_MOST_SELECTIONS = 3, 2
+"""Most selections that are repeated with new derivatives: without an empirical term, and with one, where more hardly help."""
 _ABSORBED_SHARE = 0.5
 """The linearised model is inexact if its error exceeds this share of the log-likelihood ratio of any selected effect."""
 
@@ -179,8 +180,7 @@ def select_and_refit(given: SearchInput, first: MeanSearch) -> SearchOutcome:
     best = _simpler(given, best, linear, ties=not alone)
     if best is None or best.complexity > (0, 1):
         relinearised, complete = _relinearised(given, linear)
-        if relinearised is not linear:
-            best = _simpler(given, best, relinearised, ties=True, complete=complete)
+        best = _simpler(given, best, relinearised, ties=True, complete=complete)
     return linear if best is None else best
 
 
@@ -197,19 +197,16 @@ def outline_effects(given: SearchInput, first: MeanSearch) -> list[Estimate]:
 def _relinearised(given: SearchInput, linear: SearchOutcome) -> tuple[SearchOutcome, bool]:
     """Repeat a selection with derivatives taken at the model that holds its effects, until it selects the same ones again.
 
-    This is the Gauss-Newton iteration, with the set of effects free as well as their sizes. It ends with the linearised selection
-    where an empirical term is selected with the new derivatives too: then the misfit does not come from linearising.
+    This is the Gauss-Newton iteration, with the set of effects free as well as their sizes.
 
     Returns
     -------
     The last selection, and whether it repeats the one before: then it has searched for all effects that it may lack.
     """
-    found, seen = linear, list[set[str]]()
-    while (names := {each.candidate.name for each in found.estimates}) not in seen and len(seen) < _MOST_SELECTIONS:
+    found, seen, most = linear, list[set[str]](), _MOST_SELECTIONS[linear.complexity[0] > 0]
+    while (names := {each.candidate.name for each in found.estimates}) not in seen and len(seen) < most:
         seen.append(names)
         found = _selected_at_fit(given, found) or found
-        if linear.complexity[0] and found.complexity[0] >= linear.complexity[0]:
-            return linear, False
     return found, found is not linear and names == seen[-1]
 
 
