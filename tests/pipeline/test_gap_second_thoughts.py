@@ -201,6 +201,36 @@ def test_a_low_pass_that_others_feign_takes_no_outlines_along(monkeypatch: pytes
     assert [each.name for each in found.pass_input.edge_effects] == ["edge_fattening"]
 
 
+@pytest.mark.parametrize(
+    ("after", "again"),
+    [
+        ({}, False),
+        ({"radius_px": 3.04}, False),  # by less than a tenth of its standard deviation
+        ({"radius_px": 3.06}, True),
+        ({"step_px": 1.01}, True),  # no standard deviation is known
+        ({"window": "disc"}, True),
+        (None, True),  # another effect
+    ],
+)
+def test_a_search_is_repeated_where_edge_effects_change(
+    monkeypatch: pytest.MonkeyPatch, after: dict[str, Any] | None, again: bool
+) -> None:
+    nowhere, std = np.zeros(1, dtype=bool), {"radius_px": 0.5}
+    before = EdgeEffect(EdgeFattening(radius_px=3.0), std, 50.0, nowhere)
+    changed = Smoothing(sigma_px=2.0) if after is None else before.effect.model_copy(update=after)
+    seen = EdgeEffect(changed, {"sigma_px": 0.1} if after is None else std, 50.0, nowhere)
+    made: list[list[EdgeEffect]] = []
+
+    def with_these(effects: list[EdgeEffect]) -> Any:
+        made.append(effects)
+        return SimpleNamespace(edge_effects=effects, start=lambda *_: SimpleNamespace(outline=lambda: ["camera_phi"]))
+
+    monkeypatch.setattr(selection_passes, "select_effects", lambda *_: ([], None))
+    inputs: Any = SimpleNamespace(edge_effects=[before], edge_effects_given=lambda _: [seen], with_these=with_these)
+    select_beside_edge_effects(inputs, KeyedRandom(1), frozenset())
+    assert len(made) == 1 + again
+
+
 def test_an_unknown_without_a_name_says_what_remains_is_most_like() -> None:
     """The note names the largest form that was tried, except steps at a place, with its size.
 
@@ -306,16 +336,23 @@ def test_smoothing_must_also_show_beside_the_effect_that_makes_residuals_smalles
         (["ab", "ac", "ac"], 2, True),
         (["ab", "ac", "ab"], 2, False),  # it goes round in a circle
         (["ab", "ac", "ad", "ae"], 3, False),  # each one differs, and no more are made
+        (["aE", "bE", "cE"], 2, False),  # nor are they beside an empirical term, after two
+        (["aE", "bE", "bE"], 2, True),
         (["ab", ""], 0, False),  # the model cannot hold the effects
     ],
 )
 def test_a_selection_is_repeated_until_it_selects_the_same_again(
     monkeypatch: pytest.MonkeyPatch, selections: list[str], kept: int, complete: bool
 ) -> None:
-    """A selection counts as complete only if it equals the one before. Each letter stands for an effect."""
+    """A selection counts as complete only if it equals the one before.
+
+    Each small letter stands for an effect, and a capital one for an empirical term.
+    """
 
     def selected(names: str) -> Any:
-        return SimpleNamespace(estimates=[SimpleNamespace(candidate=SimpleNamespace(name=name)) for name in names])
+        curves = sum(map(str.isupper, names))
+        estimates = [SimpleNamespace(candidate=SimpleNamespace(name=name)) for name in names]
+        return SimpleNamespace(estimates=estimates, complexity=(curves, len(names) - curves))
 
     given: Any = None
     outcomes = [selected(names) if names else None for names in selections]
