@@ -119,7 +119,7 @@ def next_step(result: Result) -> str:
 
 
 def _cautions(notes: Iterable[str]) -> str:
-    """Those remarks without which numbers would mislead, as sentences, each after a space."""
+    """Return the cautions among some remarks, without which the numbers would mislead, as sentences with a space before each."""
     return "".join(f" {note[0].upper()}{note[1:]}." for note in notes if note.startswith(CAUTION))
 
 

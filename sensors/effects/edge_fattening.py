@@ -74,7 +74,7 @@ class FatteningTrials:
         self._largest: dict[tuple[str, int], FloatArray] = {}
 
     def fattened(self, effect: EdgeFattening, cell_px: float, jump_px: float) -> FloatArray:
-        """Return the disparities of the cells of interest after an edge fattening, px, as `EdgeFattening.filtered` gives them.
+        """Return the disparities after edge fattening, px, in the cells of interest alone, in the form that `look_up` returns.
 
         effect: the edge fattening to try. cell_px, jump_px: as for `EdgeFattening.filtered`.
         """

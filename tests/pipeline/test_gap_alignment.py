@@ -27,11 +27,14 @@ def moved(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFacto
     pair = read_measurement(folder / "case")
     assert isinstance(pair, StereoMeasurement)
     noise = pair.model.noise.model_copy(update={"parallax_sigma_px": 5 * pair.model.noise.parallax_sigma_px})
-    return pair.changed(model=pair.model.model_copy(update={"noise": noise})).moved(MOVE)  # few points give a precise pose
+    return pair.changed(model=pair.model.model_copy(update={"noise": noise})).moved(
+        MOVE
+        # with a larger predicted noise, the pose of few points is precise enough
+    )
 
 
 def traced(monkeypatch: pytest.MonkeyPatch) -> list[int]:
-    """Return a list to which the number of points is added whenever residuals are computed."""
+    """Record how many points each computation of residuals has, in the list that is returned."""
     counts, plain = [], alignment.compute_residuals
 
     def counted(measurement: Measurement) -> alignment.Residuals:
@@ -43,7 +46,7 @@ def traced(monkeypatch: pytest.MonkeyPatch) -> list[int]:
 
 
 def test_residuals_of_all_points_are_computed_once(moved: Measurement, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The pose differs from that of all points by no more than that of independent points would.
+    """The pose from a part of the points differs from that of all by no more than the noise of the part lets expect.
 
     Without the part, they are computed before and after the move. A pose of six values from m points moves the predictions by
     sqrt(6 / m) standard deviations (root mean square); four times this is allowed.

@@ -1,4 +1,4 @@
-"""Effects of a stereo matcher on small disparity maps, against slow calculations cell by cell."""
+"""Effects of a stereo matcher on small disparity maps; the expected maps are computed cell by cell, with simple loops."""
 
 from __future__ import annotations
 

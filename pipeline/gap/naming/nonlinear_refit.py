@@ -31,7 +31,7 @@ from scene.geometry.mesh import FloatArray
 _MOST_CONVERGED, _MOST_ROUNDS, _CONVERGED_GAIN = 3, 8, 1.0
 """Number of effects that are refitted to convergence, largest number of iterations, and gain of log-likelihood that ends them."""
 _MOST_SELECTIONS = 3, 2
-"""Most selections that are repeated with new derivatives: without an empirical term, and with one, where more hardly help."""
+"""How often a selection is repeated with new derivatives at most: without an empirical term and with one, where it helps less."""
 _ABSORBED_SHARE = 0.5
 """The linearised model is inexact if its error exceeds this share of the log-likelihood ratio of any selected effect."""
 

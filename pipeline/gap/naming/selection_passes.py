@@ -46,7 +46,7 @@ size one computation takes 0.4 s.
 """
 
 _NEGLIGIBLE = 0.1
-"""Change of an edge effect's parameter, in its standard deviations, for which a search is not repeated."""
+"""Largest change of an edge effect's parameter, in its standard deviations, after which the search is not repeated."""
 
 
 @dataclass(frozen=True)

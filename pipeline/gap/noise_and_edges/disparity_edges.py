@@ -51,7 +51,7 @@ _FILLED_SHARE, _STRAY_SHARE = 0.9, 0.02
 _EDGE_MARGIN_CELLS, _REGISTRATIONS = 2, 3
 """Cells beyond the radius of edge fattening that are unpredictable too, and registrations beside a low-pass."""
 _SPOILT = 0.01
-"""Log-likelihood per point by which a pose must be better for it to be tried: one that is off spoils predictions everywhere."""
+"""Least gain in log-likelihood per point for which another pose is tried. A wrong pose costs much more, all over the wall."""
 _STEP_MARGIN = 1.1
 """Ratio of steps between which it is uncertain whether a matcher counts a difference as a step."""
 _COPY_TOLERANCE = 0.02

@@ -41,8 +41,8 @@ points: a shift and a rotation of a distant pair can nearly cancel, so that thei
 _RETRACE_FROM_SIGMAS, _MOST_MOVES_OF_SURFACES = 0.1, 12
 """The same for a surface without cameras, where only this counts: its nearest places on the reference change as it moves."""
 _MANY, _PART = 250_000, 60_000
-"""Points of a measurement from which on a pose is first estimated from a part of them, and at least how many of the trusted ones:
-their pose differs from that of all by a small part of the noise, so that the residuals of all points are computed only once.
+"""Number of points from which on the pose is first estimated from a part of them, and the least number of points of that part.
+The pose from the part differs little from that of all points, so that the residuals of all are usually computed only once.
 """
 
 

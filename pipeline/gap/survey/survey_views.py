@@ -35,7 +35,7 @@ from sensors.stereo.stereo_pair import REDUCTION, Quality, StereoPair
 _MOST_PULSES = 30_000
 """Most pulses or pixels of a view's subsample."""
 _MOST_TRACED = 100_000
-"""Points of a measured pair from which a view is made: one in k, where at least twice as many lie in it."""
+"""Least number of points of a measured pair from which its view is made. Larger pairs are thinned evenly, to save time."""
 _FEWEST_POINTS = 300
 """Fewest points on smooth parts of the wall."""
 _ALBEDO_SPREAD = 0.3
